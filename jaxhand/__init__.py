@@ -1,0 +1,1 @@
+"""Tracks hands from labelled optical markers, with holes: the JAX side."""

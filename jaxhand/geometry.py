@@ -1,0 +1,249 @@
+"""Rigid motions: weighted Kabsch with a prior, rotations, mirror. Twin of `numpy_infer.geometry`.
+
+Points are rows, rotations act on columns: `world = hand @ rotation.T + translation`.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from numpy_infer.arrays import Array
+from numpy_infer.geometry import PRIOR_STRENGTH
+
+_NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
+
+
+def product(a: Array, b: Array) -> Array:
+    """Matrix product of small matrices as multiply and sum: XLA fuses it, where batched `dot` is a
+    call for each matrix, and it stays float32 on devices whose `dot` would round to less."""
+    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
+
+
+def mirror(points: Array) -> Array:
+    """`[..., 3]` points reflected in the plane x = 0, exactly: a right hand becomes a left one."""
+    return points * jnp.array([-1, 1, 1], points.dtype)
+
+
+def mirror_rotation(rotation: Array) -> Array:
+    """`[..., 3, 3]` the rotation that `mirror` makes of `rotation`, exactly."""
+    sign = jnp.array([-1, 1, 1], rotation.dtype)
+    return rotation * sign[:, None] * sign
+
+
+def centre(points: Array, weight: Array) -> tuple[Array, Array]:
+    """`[..., N, 3]` points from their weighted mean, and the mean `[..., 3]`.
+
+    Centred twice: the first mean is rounded at the size of world coordinates, and in float32 that
+    alone would lift three points out of their own plane.
+    """
+    mean = mean_point(points, weight)
+    centred = points - mean[..., None, :]
+    return centred - mean_point(centred, weight)[..., None, :], mean
+
+
+def transform(rotation: Array, translation: Array, points: Array) -> Array:
+    """`[..., N, 3]` points moved by `[..., 3, 3]`, `[..., 3]`: `points @ rotation.T + t`."""
+    return product(points, jnp.swapaxes(rotation, -1, -2)) + translation[..., None, :]
+
+
+def untransform(rotation: Array, translation: Array, points: Array) -> Array:
+    """`[..., N, 3]` points moved by the inverse of (`rotation`, `translation`)."""
+    return product(points - translation[..., None, :], rotation)
+
+
+def mean_point(points: Array, weight: Array) -> Array:
+    """`[..., 3]` weighted mean of `[..., N, 3]` points; the origin where all weights are 0."""
+    total = weight.sum(-1)[..., None]
+    return (points * weight[..., None]).sum(-2) / jnp.where(total > 0, total, 1)
+
+
+def second_extent(points: Array, weight: Array) -> Array:
+    """`[...]` second singular value of the weighted, centred `[..., N, 3]` points, in metres: 0 for
+    collinear points. The largest eigenvalue of the 3×3 scatter stands in closed form (Smith 1961);
+    the second comes from it, trace and determinant: Smith's is 3 mm for a 20 cm line in float32."""
+    centred = (points - mean_point(points, weight)[..., None, :]) * jnp.sqrt(weight)[..., None]
+    scatter = product(jnp.swapaxes(centred, -1, -2), centred)
+    mean = (scatter[..., 0, 0] + scatter[..., 1, 1] + scatter[..., 2, 2]) / 3
+    deviation = scatter - mean[..., None, None] * jnp.eye(3, dtype=scatter.dtype)
+    radius = jnp.sqrt((deviation * deviation).sum((-1, -2)) / 6)
+    unit = deviation / jnp.where(radius > 0, radius, 1)[..., None, None]
+    angle = jnp.arccos(jnp.clip(determinant(unit) / 2, -1, 1)) / 3
+    largest = mean + 2 * radius * jnp.cos(angle)
+    half = jnp.maximum(3 * mean - largest, 0) / 2
+    product_of_two = determinant(scatter) / jnp.where(largest > 0, largest, 1)
+    gap = half * half - jnp.clip(product_of_two, 0, half * half)
+    return jnp.sqrt(half + jnp.sqrt(gap))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """`[..., 3]` cross product. Written out, as in the twin, so that it fuses."""
+    return a[..., _NEXT] * b[..., _AFTER] - a[..., _AFTER] * b[..., _NEXT]
+
+
+def determinant(matrix: Array) -> Array:
+    """`[...]` determinant of `[..., 3, 3]`."""
+    return (matrix[..., 0, :] * cross(matrix[..., 1, :], matrix[..., 2, :])).sum(-1)
+
+
+def solve(matrix: Array, vector: Array) -> Array:
+    """`[..., 3]` x with `matrix @ x = vector`, for a symmetric positive `[..., 3, 3]` matrix."""
+    a, b, c = (matrix[..., i, 0] for i in range(3))
+    d, e, f = matrix[..., 1, 1], matrix[..., 2, 1], matrix[..., 2, 2]
+    # L D Lᵀ: stable where cofactors, in float32, are not.
+    ba, ca = b / a, c / a
+    d2, e2 = d - ba * b, e - ba * c
+    ed = e2 / d2
+    f3 = f - ca * c - ed * e2
+    x, y, z = (vector[..., i] for i in range(3))
+    y = y - ba * x
+    z = (z - ca * x - ed * y) / f3
+    y = y / d2 - ed * z
+    return jnp.stack([x / a - ba * y - ca * z, y, z], -1)
+
+
+def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[Array, Array]:
+    """Rigid motion that takes `source` to `target` with least weighted squares (paper, equation 2).
+
+    Args:
+        source: `[..., N, 3]` metres.
+        target: `[..., N, 3]` metres.
+        weight: `[..., N]`, not negative; points of weight 0 must be finite and do not matter.
+        prior: `[..., 3, 3]` a rotation. What the points leave open (0, 1, 2 or collinear points)
+            follows it, continuously: it enters with a strength that falls to 0 as the points
+            spread out, see `PRIOR_STRENGTH`. It must turn with the data to keep equivariance.
+
+    Returns:
+        `rotation [..., 3, 3]` with determinant +1, `translation [..., 3]`. Without points the
+        translation is 0.
+    """
+    source_mean, target_mean = mean_point(source, weight), mean_point(target, weight)
+    centred = (target - target_mean[..., None, :]) * weight[..., None]
+    covariance = product(jnp.swapaxes(centred, -1, -2), source - source_mean[..., None, :])
+    rotation = nearest_rotation(covariance + prior_weight(covariance)[..., None, None] * prior)
+    return rotation, target_mean - product(rotation, source_mean[..., None])[..., 0]
+
+
+def prior_weight(covariance: Array) -> Array:
+    """`[...]` how much of the prior to add to a `[..., 3, 3]` cross-covariance, in m²."""
+    cofactors = cross(covariance[..., _NEXT, :], covariance[..., _AFTER, :])
+    size = jnp.sqrt((covariance * covariance).sum((-1, -2)))
+    second = jnp.sqrt((cofactors * cofactors).sum((-1, -2))) / jnp.where(size > 0, size, 1)
+    return PRIOR_STRENGTH * jnp.maximum(0, 1 - second / PRIOR_STRENGTH) ** 2
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """`[..., 3, 3]` the rotation R that maximises tr(Rᵀ matrix) (Kabsch 1976; Umeyama 1991).
+
+    Not by SVD, which is a LAPACK call for each matrix. Horn's (1987) symmetric 4×4 matrix, whose
+    leading eigenvector is the quaternion of R, is shifted to be positive and squared until that
+    eigenvector alone is left; three Newton steps on the rotations then remove float32's error.
+    All of it on scalars side by side, because XLA runs those as one loop over the batch.
+    """
+    size = jnp.sqrt((matrix * matrix).sum((-1, -2), keepdims=True))
+    unit = matrix / jnp.where(size > 0, size, 1)
+    m = tuple(tuple(unit[..., i, j] for j in range(3)) for i in range(3))
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = m
+    # |unit| = 1, so the eigenvalues lie within ±√3 and a shift of 1.75 makes all of them positive.
+    horn = (
+        *(xx - yy - zz + 1.75, xy + yx, xz + zx, zy - yz),
+        *(yy - xx - zz + 1.75, yz + zy, xz - zx),
+        *(zz - xx - yy + 1.75, yx - xy),
+        xx + yy + zz + 1.75,
+    )
+    xx, xy, xz, xw, yy, yz, yw, zz, zw, ww = jax.lax.fori_loop(0, 24, _squared, horn)
+    columns = ((xx, xy, xz, xw), (xy, yy, yz, yw), (xz, yz, zz, zw), (xw, yw, zw, ww))
+    # Every column of the projector is the eigenvector; take the longest.
+    pivot = jnp.argmax(jnp.stack([xx, yy, zz, ww], -1), -1)
+    q = tuple(jnp.select([pivot == i for i in range(4)], list(column)) for column in columns)
+    q = jax.lax.fori_loop(0, 3, lambda _, q: _newton(m, q), _normalised(q))
+    return jnp.stack([jnp.stack(row, -1) for row in _rotation(q)], -2)
+
+
+def _squared(_: int, upper: tuple[Array, ...]) -> tuple[Array, ...]:
+    """The square, scaled to trace 1, of a symmetric 4×4 matrix given by its 10 upper entries."""
+    a, b, c, d, e, f, g, h, i, j = upper
+    square = (
+        *(a * a + b * b + c * c + d * d, a * b + b * e + c * f + d * g),
+        *(a * c + b * f + c * h + d * i, a * d + b * g + c * i + d * j),
+        *(b * b + e * e + f * f + g * g, b * c + e * f + f * h + g * i),
+        b * d + e * g + f * i + g * j,
+        *(c * c + f * f + h * h + i * i, c * d + f * g + h * i + i * j),
+        d * d + g * g + i * i + j * j,
+    )
+    scale = 1 / (square[0] + square[4] + square[7] + square[9])
+    return tuple(entry * scale for entry in square)
+
+
+def _normalised(q: tuple[Array, ...]) -> tuple[Array, ...]:
+    scale = 1 / jnp.sqrt(sum(entry * entry for entry in q))
+    return tuple(entry * scale for entry in q)
+
+
+def _rotation(q: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:
+    x, y, z, w = q
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def _newton(matrix: tuple[tuple[Array, ...], ...], q: tuple[Array, ...]) -> tuple[Array, ...]:
+    """One Newton step for max tr(Rᵀ matrix) from the unit quaternion `q`."""
+    rotation = _rotation(q)
+    m = [[sum(rotation[k][i] * matrix[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
+    gradient = (m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1])
+    # Minus the Hessian, tr(S) I − S with S the symmetric part of m, solved by its cofactors.
+    a, b, c = m[1][1] + m[2][2], m[0][0] + m[2][2], m[0][0] + m[1][1]
+    d, e, f = -(m[0][1] + m[1][0]) / 2, -(m[0][2] + m[2][0]) / 2, -(m[1][2] + m[2][1]) / 2
+    cofactors = (
+        (b * c - f * f, e * f - c * d, d * f - b * e),
+        (e * f - c * d, a * c - e * e, d * e - a * f),
+        (d * f - b * e, d * e - a * f, a * b - d * d),
+    )
+    det = a * cofactors[0][0] + d * cofactors[0][1] + e * cofactors[0][2]
+    # A rotation that the matrix leaves open has no Newton step.
+    scale = jnp.where(det > 1e-14, 0.5 / jnp.where(det > 1e-14, det, 1), 0)
+    i, j, k = (
+        jnp.clip(scale * sum(entry * g for entry, g in zip(row, gradient, strict=True)), -0.1, 0.1)
+        for row in cofactors
+    )
+    x, y, z, w = q
+    return _normalised(
+        (
+            x + w * i + y * k - z * j,
+            y + w * j + z * i - x * k,
+            z + w * k + x * j - y * i,
+            w - x * i - y * j - z * k,
+        )
+    )
+
+
+def quaternion(rotation: Array) -> Array:
+    """`[..., 4]` unit quaternion xyzw with w ≥ 0 of `[..., 3, 3]`.
+
+    The largest of the four possible pivots is taken (Shepperd 1978), so no rotation is singular.
+    """
+    m = rotation
+    trace = jnp.trace(m, axis1=-2, axis2=-1)
+    diagonal = jnp.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], -1)
+    squares = jnp.concatenate([1 + 2 * diagonal - trace[..., None], 1 + trace[..., None]], -1)
+    xy, xw = m[..., 1, 0] + m[..., 0, 1], m[..., 2, 1] - m[..., 1, 2]
+    xz, yw = m[..., 0, 2] + m[..., 2, 0], m[..., 0, 2] - m[..., 2, 0]
+    yz, zw = m[..., 2, 1] + m[..., 1, 2], m[..., 1, 0] - m[..., 0, 1]
+    s = jnp.moveaxis(squares, -1, 0)
+    candidates = jnp.stack(
+        [
+            jnp.stack([s[0], xy, xz, xw], -1),
+            jnp.stack([xy, s[1], yz, yw], -1),
+            jnp.stack([xz, yz, s[2], zw], -1),
+            jnp.stack([xw, yw, zw, s[3]], -1),
+        ],
+        -2,
+    )
+    pivot = jnp.argmax(squares, -1)
+    q = jnp.take_along_axis(candidates, pivot[..., None, None], -2)[..., 0, :]
+    q = q / jnp.sqrt((q * q).sum(-1, keepdims=True))
+    return jnp.where(q[..., 3:] < 0, -q, q)

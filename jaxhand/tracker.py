@@ -1,0 +1,395 @@
+"""The pipeline of one frame, as pure `init` and `step`. Twin of `numpy_infer.tracker`.
+
+Register the visible markers → fill the hidden ones → continuity → hand pose from the alignment
+markers → joint angles → forward kinematics. (The gate before and calibration and finger alignment
+after are the identity as yet.)
+
+Continuity is a blend at the output. `raw` is measured where visible and predicted from measured
+markers where hidden; in the registered frame `output = raw + correction`. While the visible set is
+unchanged the correction of a visible marker shrinks at 25 cm/s (paper, section 3.2.2) and that of
+a hidden one fades with posture, `exp(−d/δ)`, d the RMS change of the registered visible markers.
+When the set changes, the previous frame is done again with the new set, and what is missing to the
+previous output becomes the correction; so the output goes on from where it was.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxhand.geometry import (
+    kabsch,
+    mean_point,
+    mirror,
+    mirror_rotation,
+    second_extent,
+    transform,
+    untransform,
+)
+from jaxhand.networks import predict
+from jaxhand.predictors import PREDICTORS, learned_step
+from jaxhand.skeleton import angles_from_rotations, forward_kinematics, rotations_from_angles
+from numpy_infer.arrays import Array
+from numpy_infer.hand import ANGLES
+from numpy_infer.model import ERROR_AGES, Model
+from numpy_infer.networks import Network
+from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
+from numpy_infer.tracker import (
+    DETERMINED_EXTENT,
+    MILLIMETRES_EXTENT,
+    SAME_POSTURE,
+    SHRINK_SPEED,
+)
+
+
+def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> State:
+    """A tracker that has seen nothing.
+
+    Args:
+        model: what to run.
+        batch: leading shape of everything: () for one hand, (hands,) for several.
+        right: True for a right hand; broadcast to `batch`.
+
+    Raises:
+        ValueError: the model's predictor is not known.
+    """
+    if model.predictor not in PREDICTORS:
+        raise ValueError(
+            f"unknown predictor {model.predictor!r}: expected one of {', '.join(PREDICTORS)}"
+        )
+    template = jnp.broadcast_to(
+        jnp.asarray(model.hand.template), (*batch, *model.hand.template.shape)
+    )
+    dtype, count = template.dtype, len(model.hand)
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*batch, 3, 3))
+    origin = jnp.zeros((*batch, 3), dtype)
+    lost = jnp.full(batch, int(TrackingState.LOST))
+    never = jnp.zeros((*batch, count), bool)
+    pose = HandPose(
+        markers=template,
+        status=jnp.full((*batch, count), int(Status.HELD)),
+        expected_error=jnp.zeros((*batch, count), dtype),
+        wrist_rotation=eye,
+        wrist_position=origin,
+        **_joints(model, template, eye, origin),
+        state=lost,
+        notice=jnp.zeros(batch, int),
+    )
+    return State(
+        right=jnp.broadcast_to(jnp.asarray(right, bool), batch),
+        predictor=PREDICTORS[model.predictor].init(model, batch),
+        pose=pose,
+        markers=jnp.zeros_like(template),
+        visible=never,
+        tracked=jnp.zeros(batch, bool),
+        tracking=jnp.zeros(batch, bool),
+        rotation=eye,
+        translation=origin,
+        seen=template,
+        known=never,
+        correction=jnp.zeros_like(template),
+        anchor=template,
+        age=jnp.zeros((*batch, count), dtype),
+    )
+
+
+def step(
+    model: Model, state: State, markers: Array, visible: Array, dt: Array
+) -> tuple[State, HandPose]:
+    """Takes in one frame.
+
+    Args:
+        model: what to run.
+        state: from `init` or the previous `step`.
+        markers: `[..., M, 3]` metres, world; a marker with a coordinate that is not finite is
+            hidden.
+        visible: `[..., M]` True where measured; hidden coordinates are never read.
+        dt: `[...]` seconds since the previous frame. If it is not positive nothing that runs on
+            time moves, and the same markers again change nothing.
+    """
+    dtype = state.markers.dtype
+    visible = visible & jnp.isfinite(markers).all(-1)
+    markers = jnp.where(visible[..., None], markers, 0).astype(dtype)
+    markers = jnp.where(state.right[..., None, None], mirror(markers), markers)
+    late = ~(dt > 0)
+    elapsed = jnp.where(late, 0, dt).astype(dtype)
+    repeated = (
+        late
+        & state.known.any(-1)
+        & (visible == state.visible).all(-1)
+        & (markers == state.markers).all((-1, -2))
+    )
+    new_state = _track(model, state, markers, visible, elapsed)
+    new_state = _where(repeated, state, new_state)
+    return new_state, _to_side(new_state, _notice(markers, visible, late))
+
+
+def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State:
+    """The state after a frame of clean input of a left hand; its `pose` is the output."""
+    weight = visible.astype(markers.dtype)
+    template = jnp.asarray(model.hand.template, markers.dtype)
+    tracking = second_extent(markers, weight) > DETERMINED_EXTENT
+    fresh = tracking & ~state.tracked
+    both = visible & state.visible
+    shift = mean_point(markers - state.markers, both.astype(markers.dtype))
+    rotation, translation = _register(state, template, markers, weight, tracking, shift)
+    # Before there was any output the template stands in for it.
+    placed = transform(rotation, translation, template)
+    last = jnp.where(state.tracked[..., None, None], state.pose.markers, placed)
+    advance, raw = _fill(
+        model, state.predictor, markers, visible, last, dt, (rotation, translation)
+    )
+    held = jnp.where(state.tracked[..., None, None], last + shift[..., None, :], placed)
+    raw = jnp.where(tracking[..., None, None], raw, held)
+    raw = jnp.where(visible[..., None], markers, raw)
+    registered = untransform(rotation, translation, raw)
+
+    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
+    correction, anchor, seen = state.correction, state.anchor, state.seen
+    redone = _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
+    restart = (changed & state.tracked)[..., None, None]
+    correction = jnp.where(restart, redone[0], correction)
+    anchor = jnp.where(restart, redone[1], anchor)
+    seen = jnp.where((changed & tracking & state.tracked)[..., None, None], redone[2], seen)
+    begin = (fresh | ~state.tracked)[..., None, None]
+    correction = jnp.where(begin, 0, correction)
+    anchor = jnp.where(begin, registered, anchor)
+    seen = jnp.where(begin & ~visible[..., None], template, seen)
+    seen = jnp.where(visible[..., None], registered, seen)
+
+    if model.continuity:
+        correction, blend = _blend(model, correction, anchor, registered, visible, tracking, dt)
+        blended = transform(rotation, translation, registered + blend)
+        raw = jnp.where((blend != 0).any(-1, keepdims=True), blended, raw)
+
+    age = jnp.where(visible, 0, state.age + dt[..., None])
+    new_state = State(
+        right=state.right,
+        predictor=advance,
+        pose=state.pose,
+        markers=markers,
+        visible=visible,
+        tracked=state.tracked | tracking,
+        tracking=tracking,
+        rotation=rotation,
+        translation=translation,
+        seen=seen,
+        known=state.known | visible,
+        correction=correction,
+        anchor=anchor,
+        age=age,
+    )
+    return new_state._replace(pose=_pose(model, new_state, raw))
+
+
+def _register(
+    state: State, template: Array, markers: Array, weight: Array, tracking: Array, shift: Array
+) -> tuple[Array, Array]:
+    """`world_from_template` of the visible markers; where they do not determine it, the previous
+    one moved along with them, and before there was one, the template at their mean."""
+    found_rotation, found_translation = kabsch(template, markers, weight, state.rotation)
+    seen_any = (weight > 0).any(-1)[..., None]
+    centred = mean_point(markers, weight) - mean_point(template, weight)
+    start = jnp.where(seen_any, centred, state.translation)
+    moved = jnp.where(state.tracked[..., None], state.translation + shift, start)
+    rotation = jnp.where(tracking[..., None, None], found_rotation, state.rotation)
+    return rotation, jnp.where(tracking[..., None], found_translation, moved)
+
+
+def _fill(
+    model: Model,
+    predictor: Any,
+    markers: Array,
+    visible: Array,
+    last: Array,
+    dt: Array,
+    registration: tuple[Array, Array],
+) -> tuple[Any, Array]:
+    """One step of the model's predictor; the learned one is spared a second registration."""
+    step_of = PREDICTORS[model.predictor].step
+    if step_of is learned_step:
+        return learned_step(model, predictor, markers, visible, last, dt, registration)
+    return step_of(model, predictor, markers, visible, last, dt)
+
+
+def _redo(
+    model: Model,
+    state: State,
+    markers: Array,
+    visible: Array,
+    tracking: Array,
+    shift: Array,
+    last: Array,
+    rotation: Array,
+    translation: Array,
+) -> tuple[Array, Array, Array]:
+    """The previous frame, done with this frame's visible set.
+
+    A marker hidden then takes its position of now, carried back by the hand's motion since.
+
+    Returns:
+        `[..., M, 3]` each, registered frame: the correction, the anchor, and where each marker was
+        seen last.
+    """
+    dtype = markers.dtype
+    template = jnp.asarray(model.hand.template, dtype)
+    before = transform(state.rotation, state.translation, state.seen)
+    before = jnp.where(state.visible[..., None], state.markers, before)
+    turn, move = _motion(state, before, markers, visible, tracking, shift)
+    returned = untransform(turn, move, markers)
+    returned = jnp.where(state.visible[..., None], state.markers, returned)
+    previous: Array = jnp.where(visible[..., None], returned, 0)
+    found = kabsch(template, previous, visible.astype(dtype), rotation)
+    then_rotation = jnp.where(tracking[..., None, None], found[0], state.rotation)
+    then_translation = jnp.where(tracking[..., None], found[1], state.translation)
+    then = (then_rotation, then_translation)
+    _, filled = _fill(
+        model, state.predictor, previous, visible, last, jnp.zeros_like(shift[..., 0]), then
+    )
+    raw = jnp.where((tracking[..., None] | visible)[..., None], filled, last)
+    correction = untransform(*then, last) - untransform(*then, raw)
+    seen = untransform(rotation, translation, transform(turn, move, before))
+    return correction, untransform(*then, previous), seen
+
+
+def _motion(
+    state: State, before: Array, markers: Array, visible: Array, tracking: Array, shift: Array
+) -> tuple[Array, Array]:
+    """The hand's rigid motion since the previous frame, from the markers seen in both.
+
+    What those leave open follows where the visible markers were seen last (`before [..., M, 3]`,
+    carried along with the hand since), if the hand had been lost or if they fit without a change of
+    posture; a posture that has changed says nothing of a rotation, so otherwise there is none.
+    """
+    dtype = markers.dtype
+    both = (visible & state.visible).astype(dtype)
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), state.rotation.shape)
+    earlier = (visible & state.known).astype(dtype)
+    turn, move = kabsch(before, markers, earlier, eye)
+    misfit = mean_point((transform(turn, move, before) - markers) ** 2, earlier).sum(-1)
+    believed = tracking & (~state.tracking | (misfit < SAME_POSTURE**2)) & (earlier > 0).any(-1)
+    turn = jnp.where(believed[..., None, None], turn, eye)
+    move = jnp.where(believed[..., None], move, shift)
+    seen_turn, seen_move = kabsch(before, markers, both, turn)
+    decide = tracking & (both > 0).any(-1)
+    return (
+        jnp.where(decide[..., None, None], seen_turn, turn),
+        jnp.where(decide[..., None], seen_move, move),
+    )
+
+
+def _blend(
+    model: Model,
+    correction: Array,
+    anchor: Array,
+    registered: Array,
+    visible: Array,
+    tracking: Array,
+    dt: Array,
+) -> tuple[Array, Array]:
+    """The corrections to keep, and those to add now; `[..., M, 3]`, registered frame."""
+    length = jnp.sqrt((correction * correction).sum(-1))
+    left = jnp.maximum(length - SHRINK_SPEED * dt[..., None], 0)
+    share = jnp.where(visible & (length > 0), left / jnp.where(length > 0, length, 1), 1)
+    correction = correction * share[..., None]
+    difference = jnp.where(visible[..., None], registered - anchor, 0)
+    seen = jnp.maximum(visible.sum(-1), 1)
+    distance = jnp.sqrt((difference * difference).sum((-1, -2)) / seen)
+    fade = jnp.where(tracking, jnp.exp(-distance / model.fade), 0)
+    blend = jnp.where(visible[..., None], correction, correction * fade[..., None, None])
+    return correction, blend
+
+
+def _pose(model: Model, state: State, output: Array) -> HandPose:
+    """The output of a frame, for a left hand, from its markers `[..., M, 3]`."""
+    template = jnp.asarray(model.hand.template, output.dtype)
+    alignment = jnp.broadcast_to(
+        jnp.asarray(model.hand.alignment_weight, output.dtype), output.shape[:-1]
+    )
+    rotation, position = kabsch(template, output, alignment, state.rotation)
+    uses_frame = PREDICTORS[model.predictor].uses_frame
+    filled = jnp.where(state.tracking & uses_frame, int(Status.PREDICTED), int(Status.HELD))
+    status = jnp.where(state.visible, int(Status.OBSERVED), filled[..., None])
+    seen_any = state.visible.any(-1)
+    degraded = jnp.where(
+        seen_any & state.tracked, int(TrackingState.DEGRADED), int(TrackingState.LOST)
+    )
+    return HandPose(
+        markers=output,
+        status=status,
+        expected_error=_expected_error(model, state.visible, state.age),
+        wrist_rotation=rotation,
+        wrist_position=position,
+        **_joints(model, output, rotation, position),
+        state=jnp.where(state.tracking, int(TrackingState.TRACKING), degraded),
+        notice=jnp.zeros(seen_any.shape, int),
+    )
+
+
+def _expected_error(model: Model, visible: Array, age: Array) -> Array:
+    """`[..., M]` metres, from the model's table by number hidden and age."""
+    table = jnp.asarray(model.expected_error, age.dtype)
+    hidden = (~visible).sum(-1)
+    row = table[jnp.clip(hidden, 1, len(table)) - 1][..., None, :]
+    ages = jnp.array(ERROR_AGES, age.dtype)
+    share = jnp.clip((age[..., None] - ages[:-1]) / (ages[1:] - ages[:-1]), 0, 1)
+    error = row[..., 0] + ((row[..., 1:] - row[..., :-1]) * share).sum(-1)
+    return jnp.where(visible, 0, error)
+
+
+def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> dict[str, Any]:
+    """The joint stage (paper, section 3.3) on all markers and the wrist's pose."""
+    if model.joints == "none":
+        return {"angles": None, "rotations": None, "positions": None}
+    network: Network = model.joint_network  # type: ignore[assignment]
+    features = untransform(rotation, position, markers)
+    features = features.reshape(*features.shape[:-2], -1)
+    angles = predict(network, features, jnp.ones(features.shape, bool))
+    local = rotations_from_angles(angles)
+    skeleton = jnp.asarray(model.hand.skeleton, markers.dtype)
+    positions, rotations = forward_kinematics(skeleton, local, rotation, position)
+    return {
+        "angles": angles_from_rotations(local).reshape(*angles.shape[:-1], len(ANGLES)),
+        "rotations": rotations,
+        "positions": positions,
+    }
+
+
+def _notice(markers: Array, visible: Array, late: Array) -> Array:
+    weight = visible.astype(markers.dtype)
+    centred = (markers - mean_point(markers, weight)[..., None, :]) * weight[..., None]
+    radius = jnp.sqrt((centred * centred).sum((-1, -2)) / jnp.maximum(weight.sum(-1), 1))
+    huge = jnp.where(radius > MILLIMETRES_EXTENT, int(Notice.SUSPECTED_MILLIMETRES), 0)
+    return huge | jnp.where(late, int(Notice.NON_POSITIVE_DT), 0)
+
+
+def _to_side(state: State, notice: Array) -> HandPose:
+    """The output as the hand's own side has it, in arrays of the caller's own."""
+    pose = state.pose
+    back = {
+        "markers": mirror,
+        "wrist_rotation": mirror_rotation,
+        "wrist_position": mirror,
+        "rotations": mirror_rotation,
+        "positions": mirror,
+    }
+    fields: dict[str, Any] = {}
+    for name, value in pose._asdict().items():
+        if name in back and value is not None:
+            right = state.right.reshape(state.right.shape + (1,) * (value.ndim - state.right.ndim))
+            fields[name] = jnp.where(right, back[name](value), value)
+        else:
+            fields[name] = value
+    return HandPose(**fields | {"notice": notice})
+
+
+def _where(condition: Array, yes: Any, no: Any) -> Any:
+    """`jnp.where` over equal trees; `condition [...]` is broadcast from the left."""
+
+    def choose(a: Array, b: Array) -> Array:
+        shape = condition.shape + (1,) * (a.ndim - condition.ndim)
+        return jnp.where(condition.reshape(shape), a, b)
+
+    return jax.tree.map(choose, yes, no)

@@ -1,0 +1,17 @@
+"""Tracks hands from labelled optical markers, with holes: the numpy runtime."""
+
+from numpy_infer.hand import Hand, load_hand
+from numpy_infer.model import Model
+from numpy_infer.pose import HandPose, Notice, Status, TrackingState
+from numpy_infer.tracker import HandTracker
+
+__all__ = [
+    "Hand",
+    "HandPose",
+    "HandTracker",
+    "Model",
+    "Notice",
+    "Status",
+    "TrackingState",
+    "load_hand",
+]

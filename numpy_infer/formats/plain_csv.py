@@ -1,0 +1,108 @@
+"""Plain CSV: the format of our own that any spreadsheet opens.
+
+    # unit: m
+    # rate: 120
+    # frames: 2
+    time,thumb_tip.x,thumb_tip.y,thumb_tip.z
+    0,0.1,0.2,0.3
+    0.00833,,,
+
+Comment lines come first; `unit` must be there or be given, `rate` and `frames` are optional. A
+blank or NaN cell is a gap. Columns that end in `.deg` (joint angles) are skipped with a note. A
+file that we write reads back bit for bit.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from numpy_infer.formats.table import (
+    TextFile,
+    check_writable,
+    hide_gaps,
+    number,
+    positive,
+    read_text,
+)
+from numpy_infer.formats.units import agreed, metres_per
+from numpy_infer.recordings import Recording, median_rate
+
+
+def read(path: Path, *, unit: float | None = None, left_handed: bool = False) -> Recording:
+    """Read a plain CSV file; ValueError names file and line."""
+    file = read_text(path)
+    comments, header = _comments(file)
+    stated = metres_per(*comments["unit"]) if "unit" in comments else None
+    scale = agreed(path, stated, unit)
+    cells = file.unique(header, file.cells(header, ","), "column")
+    names, columns, notes = _columns(file, header, cells)
+    table = file.numbers(header + 1, len(cells), ",")
+    time = table[:, 0]
+    file.check_time(time, header + 1)
+    if "frames" in comments:
+        file.check_count("frames", int(positive(*comments["frames"], "frames")), len(table))
+    rate = positive(*comments["rate"], "rate") if "rate" in comments else median_rate(time, path)
+    markers, _ = hide_gaps(table[:, columns] * scale, zeros=False)
+    recording = Recording(
+        names=names,
+        markers=markers,
+        time=time,
+        rate=rate,
+        source=str(path),
+        notes=file.notes + notes,
+    )
+    return recording.reflected() if left_handed else recording
+
+
+def write(recording: Recording, path: Path) -> None:
+    """Write metres with every digit; gaps are blank."""
+    check_writable(recording.names)
+    columns = [f"{name}.{axis}" for name in recording.names for axis in "xyz"]
+    lines = [
+        "# unit: m",
+        f"# rate: {number(recording.rate)}",
+        f"# frames: {len(recording.time)}",
+        ",".join(["time", *columns]),
+    ]
+    markers = np.where(recording.visible[..., None], recording.markers, np.nan)
+    for time, row in zip(recording.time, markers.reshape(len(markers), -1).tolist(), strict=True):
+        cells = ["" if value != value else number(value) for value in row]
+        lines.append(",".join([number(time), *cells]))
+    path.write_text("".join(line + "\n" for line in lines), "utf-8", newline="\n")
+
+
+def _comments(file: TextFile) -> tuple[dict[str, tuple[str, str]], int]:
+    """{key: (value, FILE:LINE)} of the leading comment lines, and the header's line index."""
+    comments: dict[str, tuple[str, str]] = {}
+    for index, line in enumerate(file.lines):
+        if not line.startswith("#"):
+            return comments, index
+        key, colon, value = line[1:].partition(":")
+        if colon:
+            comments[key.strip().lower()] = (value.strip().rstrip(","), file.where(index))
+    raise file.error(len(file.lines), "the file has comments and no header")
+
+
+def _columns(
+    file: TextFile, header: int, cells: tuple[str, ...]
+) -> tuple[tuple[str, ...], np.ndarray, tuple[str, ...]]:
+    """Marker names, the [M, 3] columns of their coordinates, and notes about skipped columns."""
+    if cells[0] != "time":
+        raise file.error(header, f"expected the first column to be time, found {cells[0]!r}")
+    angles = [cell for cell in cells if cell.endswith(".deg")]
+    coordinates = [cell for cell in cells[1:] if cell not in angles]
+    names = tuple(dict.fromkeys(cell.rpartition(".")[0] for cell in coordinates))
+    for cell in coordinates:
+        if not cell.endswith((".x", ".y", ".z")) or len(cell) < 3:
+            raise file.error(header, f"unknown column {cell!r}; expected NAME.x, NAME.y, NAME.z")
+    for name in names:
+        for axis in "xyz":
+            if f"{name}.{axis}" not in cells:
+                raise file.error(header, f"marker {name!r} has no column {name}.{axis}")
+    if not names:
+        raise file.error(header, "no marker columns; expected NAME.x, NAME.y, NAME.z")
+    columns = np.array([[cells.index(f"{name}.{axis}") for axis in "xyz"] for name in names])
+    notes = (f"{len(angles)} columns of angles (.deg) are skipped",) if angles else ()
+    return names, columns, notes

@@ -1,0 +1,38 @@
+"""Lengths at a file's edge: which unit it is in."""
+
+from __future__ import annotations
+
+from math import isclose
+from pathlib import Path
+
+METRES = {
+    **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), 1.0),
+    **dict.fromkeys(("cm", "centimeter", "centimeters", "centimetre", "centimetres"), 1e-2),
+    **dict.fromkeys(("mm", "millimeter", "millimeters", "millimetre", "millimetres"), 1e-3),
+    **dict.fromkeys(("in", "inch", "inches"), 0.0254),
+    **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
+}
+
+
+def metres_per(name: str, where: str) -> float:
+    """Metres per unit called `name`; ValueError at `where` (FILE:LINE) for an unknown one."""
+    metres = METRES.get(name.strip().lower())
+    if metres is None:
+        raise ValueError(f"{where}: unknown unit {name.strip()!r}; known: {', '.join(METRES)}")
+    return metres
+
+
+def agreed(path: Path, stated: float | None, given: float | None) -> float:
+    """Metres per file unit from what the file states and what the user gave.
+
+    Raises ValueError if neither says it, or if they disagree.
+    """
+    if stated is not None and given is not None and not isclose(stated, given, rel_tol=1e-9):
+        raise ValueError(f"{path}: the file's unit is {stated} m, but unit={given} was given")
+    metres = given if stated is None else stated
+    if metres is None:
+        raise ValueError(
+            f"{path}: the file does not state its unit; pass unit=METRES, the metres in one of "
+            "its units (0.001 for millimetres)"
+        )
+    return metres

@@ -1,0 +1,239 @@
+"""The model and its file: one `.npz` with a JSON header, never a pickle, every part checked."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from numpy_infer.arrays import Array
+from numpy_infer.hand import ANGLES, Hand, hand_from_json
+from numpy_infer.networks import Network, array_shapes, read_spec, write_spec
+
+FORMAT, VERSION = "jaxhand-model", 1
+
+SIZE_LIMIT = 64 << 20
+"""Bytes: more than this, unpacked, is no model of ours and is not read."""
+
+ERROR_AGES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0)
+"""Seconds hidden at which `Model.expected_error` stands; between them it is linear."""
+
+PAPER_AFFINE_ERROR = (
+    (0.0, 0.0097, 0.0154, 0.0242, 0.0292, 0.0367),
+    (0.0, 0.0106, 0.0169, 0.0261, 0.0347, 0.0412),
+    (0.0, 0.0122, 0.0196, 0.0295, 0.0365, 0.0452),
+    (0.0, 0.0166, 0.0268, 0.0406, 0.0534, 0.0545),
+)
+"""Metres, the paper's Table 3, rows AC: what is expected of a model nobody has measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Everything the tracker needs to run."""
+
+    hand: Hand
+    predictor: str = "affine"
+    """A name in `predictors.PREDICTORS`: what fills hidden markers."""
+    joints: str = "none"
+    """`learned`: the joint network makes the joint angles; `none`: there are none."""
+    marker_network: Network | None = None
+    """`[3M]` registered markers, metres → the same; needed by the predictor `learned`."""
+    joint_network: Network | None = None
+    """`[3M]` markers in the hand frame, metres → `[26]` radians; needed by the stage `learned`."""
+    fade: float = 0.03
+    """Metres: δ of the continuity blend, see `tracker`."""
+    continuity: bool = True
+    """Blend the output; without it predictors stand bare, as in the authors' program."""
+    expected_error: Array = field(default_factory=lambda: np.array(PAPER_AFFINE_ERROR))
+    """`[K, 6]` metres: mean error with 1…K markers hidden, at `ERROR_AGES`."""
+    training: Mapping[str, Any] = field(default_factory=dict)
+    """Plain data about how the model was made and measured."""
+
+    def __post_init__(self) -> None:
+        if self.joints not in ("learned", "none"):
+            raise ValueError(f"unknown joint stage {self.joints!r}: expected 'learned' or 'none'")
+        inputs = 3 * len(self.hand)
+        for name, network, needed, outputs in (
+            ("marker_network", self.marker_network, self.predictor == "learned", inputs),
+            ("joint_network", self.joint_network, self.joints == "learned", len(ANGLES)),
+        ):
+            if network is None and needed:
+                raise ValueError(f"the stage 'learned' needs a {name}, and the model has none")
+            if network is not None and isinstance(network.input_mean, np.ndarray):
+                _check_network(name, network, inputs, outputs)
+
+
+def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
+    """Writes a model file. It appears whole or not at all.
+
+    Raises:
+        ValueError: the file exists and `overwrite` is False.
+    """
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists: choose another name, or ask to overwrite it")
+    arrays = {"expected_error": np.asarray(model.expected_error, np.float64)}
+    networks = {}
+    for name in ("marker_network", "joint_network"):
+        network = getattr(model, name)
+        if network is not None:
+            networks[name] = write_spec(network.spec)
+            arrays.update({f"{name}/{key}": value for key, value in _parts(network).items()})
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "hand": model.hand.to_json(),
+        "predictor": model.predictor,
+        "joints": model.joints,
+        "networks": networks,
+        "fade": model.fade,
+        "continuity": model.continuity,
+        "training": dict(model.training),
+    }
+    header["checksum"] = _checksum(header, arrays)
+    text = json.dumps(header, indent=1, allow_nan=False).encode()
+    buffer = io.BytesIO()
+    np.savez(buffer, allow_pickle=False, header=np.frombuffer(text, np.uint8), **arrays)
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(buffer.getvalue())
+    os.replace(part, path)
+
+
+def load(path: str | Path) -> Model:
+    """Reads a model file.
+
+    Raises:
+        ValueError: not a model file, another version, a missing, extra, misshapen or corrupted
+            array; the message names the file and the culprit.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return _read(archive)
+    except FileNotFoundError:
+        raise ValueError(f"no model file {path}") from None
+    except (zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, OSError) as error:
+        raise ValueError(f"{path}: not a model file, or a damaged one: {error}") from None
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _read(archive: zipfile.ZipFile) -> Model:
+    sizes = {info.filename: info.file_size for info in archive.infolist()}
+    if len(sizes) != len(archive.infolist()):
+        raise ValueError("a part stands twice")
+    if sum(sizes.values()) > SIZE_LIMIT:
+        raise ValueError(f"unpacks to more than {SIZE_LIMIT >> 20} MB, which no model does")
+    if "header.npy" not in sizes:
+        raise ValueError("not a model file: it has no header")
+    header = json.loads(bytes(_array(archive, "header.npy")).decode())
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise ValueError("not a model file: its header says nothing of " + FORMAT)
+    if header.get("version") != VERSION:
+        raise ValueError(
+            f"written in version {header.get('version')!r}, this program reads version {VERSION}"
+        )
+    expected = {"format", "version", "hand", "predictor", "joints", "networks", "fade"}
+    expected |= {"continuity", "training", "checksum"}
+    if set(header) != expected or not isinstance(header["networks"], dict):
+        raise ValueError(f"damaged header: expected {sorted(expected)}, found {sorted(header)}")
+    hand = hand_from_json(header["hand"])
+    shapes: dict[str, tuple[int, ...]] = {}
+    specs = {name: read_spec(layers) for name, layers in header["networks"].items()}
+    for name, outputs in (("marker_network", 3 * len(hand)), ("joint_network", len(ANGLES))):
+        if name in specs:
+            inputs = 3 * len(hand)
+            scaling = {"input_mean": (inputs,), "input_scale": (inputs,)}
+            scaling |= {"output_mean": (outputs,), "output_scale": (outputs,)}
+            wanted = array_shapes(specs[name], inputs) | scaling
+            shapes |= {f"{name}/{key}": shape for key, shape in wanted.items()}
+    names = {f"{name}.npy" for name in (*shapes, "expected_error", "header")}
+    for part in sorted(names ^ set(sizes)):
+        raise ValueError(f"array {part[:-4]!r} is {'missing' if part in names else 'unexpected'}")
+    arrays = {name: _array(archive, f"{name}.npy") for name in ("expected_error", *shapes)}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise ValueError(f"array {name!r}: expected shape {shape}, found {arrays[name].shape}")
+    checksum = header.pop("checksum")
+    if _checksum(header, arrays) != checksum:
+        raise ValueError("the checksum does not fit: the file is damaged")
+    networks = {
+        name: Network(spec, **_gather(arrays, name, array_shapes(spec, 3 * len(hand))))
+        for name, spec in specs.items()
+    }
+    _check_header(header)
+    return Model(
+        hand=hand,
+        predictor=header["predictor"],
+        joints=header["joints"],
+        fade=header["fade"],
+        continuity=header["continuity"],
+        expected_error=arrays["expected_error"],
+        training=header["training"],
+        **networks,
+    )
+
+
+def _check_header(header: Mapping[str, Any]) -> None:
+    kinds = {"predictor": str, "joints": str, "fade": float, "continuity": bool, "training": dict}
+    for key, kind in kinds.items():
+        if not isinstance(header[key], kind):
+            raise ValueError(f"header: expected {key!r} as {kind.__name__}, found {header[key]!r}")
+    if not 0 < header["fade"] < float("inf"):
+        raise ValueError(f"header: 'fade' must be positive metres, found {header['fade']}")
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> Array:
+    with archive.open(name) as member:
+        return np.lib.format.read_array(member, allow_pickle=False)
+
+
+def _gather(
+    arrays: Mapping[str, Array], network: str, weights: Mapping[str, Any]
+) -> dict[str, Any]:
+    scaling = ("input_mean", "input_scale", "output_mean", "output_scale")
+    return {
+        "arrays": {key: arrays[f"{network}/{key}"] for key in weights},
+        **{key: arrays[f"{network}/{key}"] for key in scaling},
+    }
+
+
+def _parts(network: Network) -> dict[str, Array]:
+    return {
+        **{name: np.asarray(array) for name, array in network.arrays.items()},
+        "input_mean": np.asarray(network.input_mean),
+        "input_scale": np.asarray(network.input_scale),
+        "output_mean": np.asarray(network.output_mean),
+        "output_scale": np.asarray(network.output_scale),
+    }
+
+
+def _checksum(header: Mapping[str, Any], arrays: Mapping[str, Array]) -> str:
+    digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = arrays[name]
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _check_network(name: str, network: Network, inputs: int, outputs: int) -> None:
+    parts = _parts(network)
+    wanted = array_shapes(network.spec, inputs)
+    for key in sorted(set(network.arrays) ^ set(wanted)):
+        raise ValueError(f"{name}: array {key!r} is {'missing' if key in wanted else 'unexpected'}")
+    wanted |= {"input_mean": (inputs,), "input_scale": (inputs,)}
+    wanted |= {"output_mean": (outputs,), "output_scale": (outputs,)}
+    for key, shape in wanted.items():
+        array = parts[key]
+        if array.shape != shape:
+            raise ValueError(f"{name}: {key!r}: expected shape {shape}, found {array.shape}")
+        if array.dtype not in (np.float32, np.float64) or not np.isfinite(array).all():
+            raise ValueError(f"{name}: {key!r} is not an array of finite floats")

@@ -1,0 +1,99 @@
+"""What the tracker gives back and what it carries from frame to frame."""
+
+from __future__ import annotations
+
+from enum import IntEnum, IntFlag
+from typing import Any, NamedTuple
+
+from numpy_infer.arrays import Array
+
+
+class Status(IntEnum):
+    """What an output marker rests on."""
+
+    OBSERVED = 0
+    """Measured and accepted now, also while its correction shrinks."""
+    PREDICTED = 1
+    """Filled from this frame's measurements."""
+    HELD = 2
+    """Nothing in this frame determines it."""
+    REJECTED = 3
+    """Measured but refused; shown as predicted."""
+
+
+class TrackingState(IntEnum):
+    """How well the frame determines the hand."""
+
+    TRACKING = 0
+    """At least 3 non-collinear markers are measured."""
+    DEGRADED = 1
+    """Fewer; the hand is carried along by what is seen."""
+    LOST = 2
+    """None, or never yet tracked; before that the template stands in."""
+
+
+class Notice(IntFlag):
+    """What was wrong with a frame's input."""
+
+    NONE = 0
+    NON_POSITIVE_DT = 1
+    SUSPECTED_MILLIMETRES = 2
+
+
+class HandPose(NamedTuple):
+    """What `step` gives back; metres and radians, world frame. Arrays belong to the caller."""
+
+    markers: Array
+    """`[..., M, 3]` all markers."""
+    status: Array
+    """`[..., M]` a `Status` for each marker."""
+    expected_error: Array
+    """`[..., M]` metres: mean error to expect of the marker; 0 where observed."""
+    wrist_rotation: Array
+    """`[..., 3, 3]` world_from_wrist of the hand given; a right hand's is its mirror image's."""
+    wrist_position: Array
+    """`[..., 3]` the wrist joint."""
+    angles: Array | None
+    """`[..., 26]` joint angles in the order of `hand.ANGLES`; None without a joint stage."""
+    rotations: Array | None
+    """`[..., 16, 3, 3]` world_from_joint; None without a joint stage."""
+    positions: Array | None
+    """`[..., 21, 3]` joints and tips; None without a joint stage."""
+    state: Array
+    """`[...]` a `TrackingState`."""
+    notice: Array
+    """`[...]` flags of `Notice`."""
+
+
+class State(NamedTuple):
+    """What is carried from frame to frame. Everything in it is a left hand's."""
+
+    right: Array
+    """`[...]` True for a right hand."""
+    predictor: Any
+    """State of the model's predictor."""
+    pose: HandPose
+    """The previous output."""
+    markers: Array
+    """`[..., M, 3]` the previous measurements; 0 where hidden."""
+    visible: Array
+    """`[..., M]` True where the previous frame was measured."""
+    tracked: Array
+    """`[...]` True once the hand has been tracked."""
+    tracking: Array
+    """`[...]` True if it was tracked in the previous frame."""
+    rotation: Array
+    """`[..., 3, 3]` world_from_template of the previous frame."""
+    translation: Array
+    """`[..., 3]` its translation."""
+    seen: Array
+    """`[..., M, 3]` registered frame: where each marker was measured last, carried rigidly."""
+    known: Array
+    """`[..., M]` True once the marker has been measured."""
+    correction: Array
+    """`[..., M, 3]` registered frame: of a visible marker as it is now, of a hidden one as it was
+    set."""
+    anchor: Array
+    """`[..., M, 3]` registered markers when the corrections were set."""
+    age: Array
+    """`[..., M]` seconds since the marker was measured."""

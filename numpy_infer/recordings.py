@@ -1,0 +1,306 @@
+"""Recordings of labelled markers, and the one door through which marker files come in and go out.
+
+Everything inside the project is in metres and right-handed, and a hidden marker is NaN. Units,
+handedness and each format's way of writing a gap end here, at the file's edge.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import ModuleType
+
+import numpy as np
+
+BUILT_IN = {
+    name: f"numpy_infer.formats.{name}"
+    for name in ("trc", "qualisys", "plain_csv", "motive", "authors", "bvh")
+}
+READER_OF = {".trc": "trc", ".tsv": "qualisys", ".bvh": "bvh"}  # `.csv` is told by its first line
+WRITER_OF = {".trc": "trc", ".tsv": "qualisys", ".csv": "plain_csv"}
+
+# diag(1, 1, −1): a left-handed frame's coordinates in the right-handed frame that shares x and y
+_REFLECT_Z = np.array([1.0, 1.0, -1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class JointTruth:
+    """Joint positions and rotations that a file brings along with, or instead of, markers.
+
+    names: J joint names.
+    positions: [T, J, 3] metres; NaN where the file calls the frame invalid.
+    rotations: [T, J, 3, 3], acting on columns.
+    frame: "world": positions in the world, rotations world_from_joint;
+        "local": positions in the hand's own frame, rotations parent_from_joint.
+    """
+
+    names: tuple[str, ...]
+    positions: np.ndarray
+    rotations: np.ndarray
+    frame: str = "world"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "positions", np.asarray(self.positions, np.float64))
+        object.__setattr__(self, "rotations", np.asarray(self.rotations, np.float64))
+        _check_unique(self.names, "joint")
+        frames = self.positions.shape[0] if self.positions.ndim else 0
+        _check_shape("positions", self.positions, (frames, len(self.names), 3))
+        _check_shape("rotations", self.rotations, (frames, len(self.names), 3, 3))
+        if self.frame not in ("world", "local"):
+            raise ValueError(f"frame: expected 'world' or 'local', got {self.frame!r}")
+
+    def reflected(self) -> JointTruth:
+        """The same joints with z negated: p → S p, R → S R S with S = diag(1, 1, −1)."""
+        both_sides = _REFLECT_Z[:, None] * _REFLECT_Z
+        return replace(
+            self,
+            positions=self.positions * _REFLECT_Z,
+            rotations=self.rotations * both_sides,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Labelled marker positions over time.
+
+    names: M marker names, all different.
+    markers: [T, M, 3] float64 metres, right-handed world frame; NaN where not measured.
+    time: [T] seconds, finite; it need not increase.
+    rate: Hz, from the file, else the median of 1 / diff(time).
+    source: the path that it came from.
+    joints: joint truth, if the file has any.
+    filled: names whose values are partly made up by the recording software (gap filling).
+    notes: one-line things that the reader wants the user to know.
+    """
+
+    names: tuple[str, ...]
+    markers: np.ndarray
+    time: np.ndarray
+    rate: float
+    source: str
+    joints: JointTruth | None = None
+    filled: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for field in ("names", "filled", "notes"):
+            object.__setattr__(self, field, tuple(getattr(self, field)))
+        object.__setattr__(self, "markers", np.asarray(self.markers, np.float64))
+        object.__setattr__(self, "time", np.asarray(self.time, np.float64))
+        object.__setattr__(self, "rate", float(self.rate))
+        _check_unique(self.names, "marker")
+        if self.time.ndim != 1 or not self.time.size or not self.names:
+            raise ValueError(
+                "expected at least one frame and one marker, got time of shape "
+                f"{self.time.shape} and {len(self.names)} names"
+            )
+        _check_shape("markers", self.markers, (len(self.time), len(self.names), 3))
+        if not np.isfinite(self.time).all():
+            raise ValueError(f"time: frame {np.argmin(np.isfinite(self.time))} is not finite")
+        if not (np.isfinite(self.rate) and self.rate > 0):
+            raise ValueError(f"rate: expected a positive number of Hz, got {self.rate}")
+        if self.joints is not None and len(self.joints.positions) != len(self.time):
+            raise ValueError(
+                f"joints: expected {len(self.time)} frames, got {len(self.joints.positions)}"
+            )
+        _check_known(self.filled, self.names, "filled: ")
+
+    @property
+    def visible(self) -> np.ndarray:
+        """[T, M] True where all three coordinates are finite."""
+        return np.isfinite(self.markers).all(axis=-1)
+
+    def select(self, names: Sequence[str]) -> Recording:
+        """The given markers only, in the given order; ValueError lists those that are missing."""
+        _check_known(names, self.names, f"{self.source}: ")
+        columns = [self.names.index(name) for name in names]
+        return replace(
+            self,
+            names=tuple(names),
+            markers=self.markers[:, columns],
+            filled=tuple(name for name in self.filled if name in names),
+        )
+
+    def rename(self, mapping: Mapping[str, str]) -> Recording:
+        """Markers under new names {old: new}; others keep theirs. ValueError names unknown ones."""
+        _check_known(mapping, self.names, f"{self.source}: ")
+        return replace(
+            self,
+            names=tuple(mapping.get(name, name) for name in self.names),
+            filled=tuple(mapping.get(name, name) for name in self.filled),
+        )
+
+    def reflected(self) -> Recording:
+        """The recording with z negated: from a left-handed to a right-handed frame, or back."""
+        joints = None if self.joints is None else self.joints.reflected()
+        return replace(self, markers=self.markers * _REFLECT_Z, joints=joints)
+
+
+def read(
+    path: str | os.PathLike[str],
+    *,
+    unit: float | None = None,
+    left_handed: bool = False,
+    label_map: Mapping[str, str] | None = None,
+    format: str | None = None,
+) -> Recording:
+    """Read a marker file into metres and a right-handed frame.
+
+    unit: metres per unit of the file, for files that do not say (BVH, bare CSV).
+    left_handed: the file's frame is left-handed; z is negated. The authors' CSV always is, and
+        needs no telling.
+    label_map: {label in the file: our name}; other labels only lose a prefix such as `Subject:`.
+    format: a reader's name, where the suffix and the first line would pick another.
+
+    Raises ValueError, with file and line, for whatever is wrong inside the file; nothing is
+    half read. A file that is not there is the usual FileNotFoundError.
+    """
+    path = Path(path)
+    if unit is not None and not (np.isfinite(unit) and unit > 0):
+        raise ValueError(f"unit: expected metres per file unit, got {unit}")
+    reader = _reader(path, format)
+    recording: Recording = reader.read(path, unit=unit, left_handed=left_handed)
+    return _relabelled(recording, label_map or {})
+
+
+def write(recording: Recording, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+    """Write markers (not joints) in the format that the suffix names.
+
+    The file appears whole or not at all. Raises ValueError for a suffix without a writer or for
+    names that the format cannot hold, FileExistsError for a file that is there already.
+    """
+    path = Path(path)
+    writer = _writer(path)
+    if path.exists() and not overwrite:
+        raise FileExistsError(f"{path} exists; pass overwrite=True to replace it")
+    with TemporaryDirectory(dir=path.parent, prefix=".jaxhand-") as directory:
+        whole = Path(directory) / path.name
+        writer.write(recording, whole)
+        os.replace(whole, path)
+
+
+def load_label_map(path: str | os.PathLike[str]) -> dict[str, str]:
+    """Read {"label in the file": "our name"} from JSON; ValueError says what is wrong in it."""
+
+    def pairs(items: list[tuple[str, object]]) -> dict[str, object]:
+        _check_unique([label for label, _ in items], f"{path}: label")
+        return dict(items)
+
+    try:
+        mapping = json.loads(Path(path).read_text("utf-8-sig"), object_pairs_hook=pairs)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None
+    if not isinstance(mapping, dict):
+        raise ValueError(f'{path}: expected an object {{"file label": "our name"}}')
+    for label, name in mapping.items():
+        if not isinstance(name, str):
+            raise ValueError(f"{path}: {label!r}: expected a name, got {name!r}")
+    _check_unique(list(mapping.values()), f"{path}: name")
+    return mapping
+
+
+def median_rate(time: np.ndarray, source: object) -> float:
+    """Hz from [T] seconds: the median of 1 / diff over the steps that go forward."""
+    steps = np.diff(time)
+    steps = steps[steps > 0]
+    if not steps.size:
+        raise ValueError(f"{source}: no rate: the file states none and its time never advances")
+    return float(np.median(1.0 / steps))
+
+
+def _reader(path: Path, format: str | None) -> ModuleType:
+    plugins = _plugins()
+    if format is not None:
+        return _module(format, plugins)
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        return _module(_csv_format(path), plugins)
+    if suffix in READER_OF:
+        return _module(READER_OF[suffix], plugins)
+    if suffix[1:] in plugins:
+        return _module(suffix[1:], plugins)
+    known = sorted({".csv", *READER_OF, *(f".{name}" for name in plugins)})
+    raise ValueError(f"{path}: unknown suffix {suffix!r}; known: {', '.join(known)}")
+
+
+def _writer(path: Path) -> ModuleType:
+    plugins = _plugins()
+    suffix = path.suffix.lower()
+    if suffix in WRITER_OF:
+        return _module(WRITER_OF[suffix], plugins)
+    if suffix[1:] in plugins:
+        return _module(suffix[1:], plugins)
+    known = sorted({*WRITER_OF, *(f".{name}" for name in plugins)})
+    raise ValueError(f"{path}: cannot write {suffix!r}; known: {', '.join(known)}")
+
+
+def _plugins() -> dict[str, EntryPoint]:
+    # Readers that need more than numpy announce themselves, so that nothing here imports jaxhand.
+    return {point.name: point for point in entry_points(group="jaxhand.recordings")}
+
+
+def _module(name: str, plugins: Mapping[str, EntryPoint]) -> ModuleType:
+    if name in BUILT_IN:
+        return importlib.import_module(BUILT_IN[name])
+    if name in plugins:
+        module: ModuleType = plugins[name].load()
+        return module
+    raise ValueError(f"format: unknown {name!r}; known: {', '.join([*BUILT_IN, *plugins])}")
+
+
+def _csv_format(path: Path) -> str:
+    with path.open("rb") as file:
+        start = file.readline().decode("utf-8-sig", errors="replace")
+    if start.startswith(("Format Version", '"Format Version')):
+        return "motive"
+    return "authors" if ".pos.x" in start else "plain_csv"
+
+
+def _relabelled(recording: Recording, label_map: Mapping[str, str]) -> Recording:
+    """Our names for mapped labels; the others without their `Subject:` prefix."""
+    bare = {label: _without_prefix(label) for label in recording.names}
+    _check_known(label_map, (*bare, *bare.values()), f"{recording.source}: label map: ")
+    names = {label: label_map.get(label, label_map.get(bare[label], bare[label])) for label in bare}
+    by_name: dict[str, str] = {}
+    for label, name in names.items():
+        if name in by_name:
+            raise ValueError(
+                f"{recording.source}: duplicate marker name {name!r}, from {by_name[name]!r} and "
+                f"{label!r}; tell them apart with a label map"
+            )
+        by_name[name] = label
+    joints = recording.joints
+    if joints is not None:
+        joints = replace(joints, names=tuple(_without_prefix(name) for name in joints.names))
+    return replace(recording.rename(names), joints=joints)
+
+
+def _without_prefix(label: str) -> str:
+    return label.rpartition(":")[2].strip() or label
+
+
+def _check_unique(names: Sequence[str], what: str) -> None:
+    seen = set()
+    for name in names:
+        if name in seen:
+            raise ValueError(f"duplicate {what} name {name!r}")
+        seen.add(name)
+
+
+def _check_known(asked: Iterable[str], names: Sequence[str], where: str) -> None:
+    known = set(names)
+    missing = [name for name in asked if name not in known]
+    if missing:
+        raise ValueError(f"{where}no marker {', '.join(missing)}; there are {', '.join(names)}")
+
+
+def _check_shape(what: str, array: np.ndarray, expected: tuple[int, ...]) -> None:
+    if array.shape != expected:
+        raise ValueError(f"{what}: expected shape {expected}, got {array.shape}")

@@ -1,0 +1,459 @@
+"""The pipeline of one frame, as pure `init` and `step`. Twin of `jaxhand.tracker`.
+
+Register the visible markers → fill the hidden ones → continuity → hand pose from the alignment
+markers → joint angles → forward kinematics. (The gate before and calibration and finger alignment
+after are the identity as yet.)
+
+Continuity is a blend at the output. `raw` is measured where visible and predicted from measured
+markers where hidden; in the registered frame `output = raw + correction`. While the visible set is
+unchanged the correction of a visible marker shrinks at 25 cm/s (paper, section 3.2.2) and that of
+a hidden one fades with posture, `exp(−d/δ)`, d the RMS change of the registered visible markers.
+When the set changes, the previous frame is done again with the new set, and what is missing to the
+previous output becomes the correction; so the output goes on from where it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from numpy_infer.arrays import Array
+from numpy_infer.geometry import (
+    kabsch,
+    mean_point,
+    mirror,
+    mirror_rotation,
+    second_extent,
+    transform,
+    untransform,
+)
+from numpy_infer.hand import ANGLES, Hand
+from numpy_infer.model import ERROR_AGES, Model, load
+from numpy_infer.networks import Network, predict
+from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
+from numpy_infer.predictors import PREDICTORS, learned_step
+from numpy_infer.skeleton import angles_from_rotations, forward_kinematics, rotations_from_angles
+
+SHRINK_SPEED = 0.25
+"""m/s at which the correction of a visible marker dies (paper, section 3.2.2)."""
+
+DETERMINED_EXTENT = 5e-3
+"""Metres: visible markers whose second extent is smaller are as good as collinear."""
+
+SAME_POSTURE = 1e-4
+"""Metres, RMS: markers that fit this well where they were seen last tell how the hand turned."""
+
+MILLIMETRES_EXTENT = 1.0
+"""Metres: no hand is this big; coordinates that say so are in millimetres."""
+
+
+def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> State:
+    """A tracker that has seen nothing.
+
+    Args:
+        model: what to run.
+        batch: leading shape of everything: () for one hand, (hands,) for several.
+        right: True for a right hand; broadcast to `batch`.
+
+    Raises:
+        ValueError: the model's predictor is not known.
+    """
+    if model.predictor not in PREDICTORS:
+        raise ValueError(
+            f"unknown predictor {model.predictor!r}: expected one of {', '.join(PREDICTORS)}"
+        )
+    template = np.broadcast_to(model.hand.template, (*batch, *model.hand.template.shape))
+    dtype, count = template.dtype, len(model.hand)
+    eye = np.broadcast_to(np.eye(3, dtype=dtype), (*batch, 3, 3))
+    origin = np.zeros((*batch, 3), dtype)
+    lost = np.full(batch, int(TrackingState.LOST))
+    never = np.zeros((*batch, count), bool)
+    pose = HandPose(
+        markers=template,
+        status=np.full((*batch, count), int(Status.HELD)),
+        expected_error=np.zeros((*batch, count), dtype),
+        wrist_rotation=eye,
+        wrist_position=origin,
+        **_joints(model, template, eye, origin),
+        state=lost,
+        notice=np.zeros(batch, int),
+    )
+    return State(
+        right=np.broadcast_to(np.asarray(right, bool), batch),
+        predictor=PREDICTORS[model.predictor].init(model, batch),
+        pose=pose,
+        markers=np.zeros_like(template),
+        visible=never,
+        tracked=np.zeros(batch, bool),
+        tracking=np.zeros(batch, bool),
+        rotation=eye,
+        translation=origin,
+        seen=template,
+        known=never,
+        correction=np.zeros_like(template),
+        anchor=template,
+        age=np.zeros((*batch, count), dtype),
+    )
+
+
+def step(
+    model: Model, state: State, markers: Array, visible: Array, dt: Array
+) -> tuple[State, HandPose]:
+    """Takes in one frame.
+
+    Args:
+        model: what to run.
+        state: from `init` or the previous `step`.
+        markers: `[..., M, 3]` metres, world; a marker with a coordinate that is not finite is
+            hidden.
+        visible: `[..., M]` True where measured; hidden coordinates are never read.
+        dt: `[...]` seconds since the previous frame. If it is not positive nothing that runs on
+            time moves, and the same markers again change nothing.
+    """
+    dtype = state.markers.dtype
+    visible = visible & np.isfinite(markers).all(-1)
+    markers = np.where(visible[..., None], markers, 0).astype(dtype)
+    markers = np.where(state.right[..., None, None], mirror(markers), markers)
+    late = ~(dt > 0)
+    elapsed = np.where(late, 0, dt).astype(dtype)
+    repeated = (
+        late
+        & state.known.any(-1)
+        & (visible == state.visible).all(-1)
+        & (markers == state.markers).all((-1, -2))
+    )
+    new_state = _track(model, state, markers, visible, elapsed)
+    if repeated.any():
+        new_state = _where(repeated, state, new_state)
+    return new_state, _to_side(new_state, _notice(markers, visible, late))
+
+
+def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State:
+    """The state after a frame of clean input of a left hand; its `pose` is the output."""
+    weight = visible.astype(markers.dtype)
+    template = model.hand.template.astype(markers.dtype)
+    tracking = second_extent(markers, weight) > DETERMINED_EXTENT
+    fresh = tracking & ~state.tracked
+    both = visible & state.visible
+    shift = mean_point(markers - state.markers, both.astype(markers.dtype))
+    rotation, translation = _register(state, template, markers, weight, tracking, shift)
+    # Before there was any output the template stands in for it.
+    placed = transform(rotation, translation, template)
+    last = np.where(state.tracked[..., None, None], state.pose.markers, placed)
+    advance, raw = _fill(
+        model, state.predictor, markers, visible, last, dt, (rotation, translation)
+    )
+    held = np.where(state.tracked[..., None, None], last + shift[..., None, :], placed)
+    raw = np.where(tracking[..., None, None], raw, held)
+    raw = np.where(visible[..., None], markers, raw)
+    registered = untransform(rotation, translation, raw)
+
+    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
+    correction, anchor, seen = state.correction, state.anchor, state.seen
+    if changed.any():
+        redone = _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
+        restart = (changed & state.tracked)[..., None, None]
+        correction = np.where(restart, redone[0], correction)
+        anchor = np.where(restart, redone[1], anchor)
+        seen = np.where((changed & tracking & state.tracked)[..., None, None], redone[2], seen)
+    begin = (fresh | ~state.tracked)[..., None, None]
+    correction = np.where(begin, 0, correction)
+    anchor = np.where(begin, registered, anchor)
+    seen = np.where(begin & ~visible[..., None], template, seen)
+    seen = np.where(visible[..., None], registered, seen)
+
+    if model.continuity:
+        correction, blend = _blend(model, correction, anchor, registered, visible, tracking, dt)
+        blended = transform(rotation, translation, registered + blend)
+        raw = np.where((blend != 0).any(-1, keepdims=True), blended, raw)
+
+    age = np.where(visible, 0, state.age + dt[..., None])
+    new_state = State(
+        right=state.right,
+        predictor=advance,
+        pose=state.pose,
+        markers=markers,
+        visible=visible,
+        tracked=state.tracked | tracking,
+        tracking=tracking,
+        rotation=rotation,
+        translation=translation,
+        seen=seen,
+        known=state.known | visible,
+        correction=correction,
+        anchor=anchor,
+        age=age,
+    )
+    return new_state._replace(pose=_pose(model, new_state, raw))
+
+
+def _register(
+    state: State, template: Array, markers: Array, weight: Array, tracking: Array, shift: Array
+) -> tuple[Array, Array]:
+    """`world_from_template` of the visible markers; where they do not determine it, the previous
+    one moved along with them, and before there was one, the template at their mean."""
+    found_rotation, found_translation = kabsch(template, markers, weight, state.rotation)
+    seen_any = (weight > 0).any(-1)[..., None]
+    centred = mean_point(markers, weight) - mean_point(template, weight)
+    start = np.where(seen_any, centred, state.translation)
+    moved = np.where(state.tracked[..., None], state.translation + shift, start)
+    rotation = np.where(tracking[..., None, None], found_rotation, state.rotation)
+    return rotation, np.where(tracking[..., None], found_translation, moved)
+
+
+def _fill(
+    model: Model,
+    predictor: Any,
+    markers: Array,
+    visible: Array,
+    last: Array,
+    dt: Array,
+    registration: tuple[Array, Array],
+) -> tuple[Any, Array]:
+    """One step of the model's predictor; the learned one is spared a second registration."""
+    step_of = PREDICTORS[model.predictor].step
+    if step_of is learned_step:
+        return learned_step(model, predictor, markers, visible, last, dt, registration)
+    return step_of(model, predictor, markers, visible, last, dt)
+
+
+def _redo(
+    model: Model,
+    state: State,
+    markers: Array,
+    visible: Array,
+    tracking: Array,
+    shift: Array,
+    last: Array,
+    rotation: Array,
+    translation: Array,
+) -> tuple[Array, Array, Array]:
+    """The previous frame, done with this frame's visible set.
+
+    A marker hidden then takes its position of now, carried back by the hand's motion since.
+
+    Returns:
+        `[..., M, 3]` each, registered frame: the correction, the anchor, and where each marker was
+        seen last.
+    """
+    dtype = markers.dtype
+    template = model.hand.template.astype(dtype)
+    before = transform(state.rotation, state.translation, state.seen)
+    before = np.where(state.visible[..., None], state.markers, before)
+    turn, move = _motion(state, before, markers, visible, tracking, shift)
+    returned = untransform(turn, move, markers)
+    returned = np.where(state.visible[..., None], state.markers, returned)
+    previous: Array = np.where(visible[..., None], returned, 0)
+    found = kabsch(template, previous, visible.astype(dtype), rotation)
+    then_rotation = np.where(tracking[..., None, None], found[0], state.rotation)
+    then_translation = np.where(tracking[..., None], found[1], state.translation)
+    then = (then_rotation, then_translation)
+    _, filled = _fill(
+        model, state.predictor, previous, visible, last, np.zeros_like(shift[..., 0]), then
+    )
+    raw = np.where((tracking[..., None] | visible)[..., None], filled, last)
+    correction = untransform(*then, last) - untransform(*then, raw)
+    seen = untransform(rotation, translation, transform(turn, move, before))
+    return correction, untransform(*then, previous), seen
+
+
+def _motion(
+    state: State, before: Array, markers: Array, visible: Array, tracking: Array, shift: Array
+) -> tuple[Array, Array]:
+    """The hand's rigid motion since the previous frame, from the markers seen in both.
+
+    What those leave open follows where the visible markers were seen last (`before [..., M, 3]`,
+    carried along with the hand since), if the hand had been lost or if they fit without a change of
+    posture; a posture that has changed says nothing of a rotation, so otherwise there is none.
+    """
+    dtype = markers.dtype
+    both = (visible & state.visible).astype(dtype)
+    eye = np.broadcast_to(np.eye(3, dtype=dtype), state.rotation.shape)
+    earlier = (visible & state.known).astype(dtype)
+    turn, move = kabsch(before, markers, earlier, eye)
+    misfit = mean_point((transform(turn, move, before) - markers) ** 2, earlier).sum(-1)
+    believed = tracking & (~state.tracking | (misfit < SAME_POSTURE**2)) & (earlier > 0).any(-1)
+    turn = np.where(believed[..., None, None], turn, eye)
+    move = np.where(believed[..., None], move, shift)
+    seen_turn, seen_move = kabsch(before, markers, both, turn)
+    decide = tracking & (both > 0).any(-1)
+    return (
+        np.where(decide[..., None, None], seen_turn, turn),
+        np.where(decide[..., None], seen_move, move),
+    )
+
+
+def _blend(
+    model: Model,
+    correction: Array,
+    anchor: Array,
+    registered: Array,
+    visible: Array,
+    tracking: Array,
+    dt: Array,
+) -> tuple[Array, Array]:
+    """The corrections to keep, and those to add now; `[..., M, 3]`, registered frame."""
+    length = np.sqrt((correction * correction).sum(-1))
+    left = np.maximum(length - SHRINK_SPEED * dt[..., None], 0)
+    share = np.where(visible & (length > 0), left / np.where(length > 0, length, 1), 1)
+    correction = correction * share[..., None]
+    difference = np.where(visible[..., None], registered - anchor, 0)
+    seen = np.maximum(visible.sum(-1), 1)
+    distance = np.sqrt((difference * difference).sum((-1, -2)) / seen)
+    fade = np.where(tracking, np.exp(-distance / model.fade), 0)
+    blend = np.where(visible[..., None], correction, correction * fade[..., None, None])
+    return correction, blend
+
+
+def _pose(model: Model, state: State, output: Array) -> HandPose:
+    """The output of a frame, for a left hand, from its markers `[..., M, 3]`."""
+    template = model.hand.template.astype(output.dtype)
+    alignment = np.broadcast_to(model.hand.alignment_weight.astype(output.dtype), output.shape[:-1])
+    rotation, position = kabsch(template, output, alignment, state.rotation)
+    uses_frame = PREDICTORS[model.predictor].uses_frame
+    filled = np.where(state.tracking & uses_frame, int(Status.PREDICTED), int(Status.HELD))
+    status = np.where(state.visible, int(Status.OBSERVED), filled[..., None])
+    seen_any = state.visible.any(-1)
+    degraded = np.where(
+        seen_any & state.tracked, int(TrackingState.DEGRADED), int(TrackingState.LOST)
+    )
+    return HandPose(
+        markers=output,
+        status=status,
+        expected_error=_expected_error(model, state.visible, state.age),
+        wrist_rotation=rotation,
+        wrist_position=position,
+        **_joints(model, output, rotation, position),
+        state=np.where(state.tracking, int(TrackingState.TRACKING), degraded),
+        notice=np.zeros(seen_any.shape, int),
+    )
+
+
+def _expected_error(model: Model, visible: Array, age: Array) -> Array:
+    """`[..., M]` metres, from the model's table by number hidden and age."""
+    table = np.asarray(model.expected_error, age.dtype)
+    hidden = (~visible).sum(-1)
+    row = table[np.clip(hidden, 1, len(table)) - 1][..., None, :]
+    ages = np.array(ERROR_AGES, age.dtype)
+    share = np.clip((age[..., None] - ages[:-1]) / (ages[1:] - ages[:-1]), 0, 1)
+    error = row[..., 0] + ((row[..., 1:] - row[..., :-1]) * share).sum(-1)
+    return np.where(visible, 0, error)
+
+
+def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> dict[str, Any]:
+    """The joint stage (paper, section 3.3) on all markers and the wrist's pose."""
+    if model.joints == "none":
+        return {"angles": None, "rotations": None, "positions": None}
+    network: Network = model.joint_network  # type: ignore[assignment]
+    features = untransform(rotation, position, markers)
+    features = features.reshape(*features.shape[:-2], -1)
+    angles = predict(network, features, np.ones(features.shape, bool))
+    local = rotations_from_angles(angles)
+    skeleton = model.hand.skeleton.astype(markers.dtype)
+    positions, rotations = forward_kinematics(skeleton, local, rotation, position)
+    return {
+        "angles": angles_from_rotations(local).reshape(*angles.shape[:-1], len(ANGLES)),
+        "rotations": rotations,
+        "positions": positions,
+    }
+
+
+def _notice(markers: Array, visible: Array, late: Array) -> Array:
+    weight = visible.astype(markers.dtype)
+    centred = (markers - mean_point(markers, weight)[..., None, :]) * weight[..., None]
+    radius = np.sqrt((centred * centred).sum((-1, -2)) / np.maximum(weight.sum(-1), 1))
+    huge = np.where(radius > MILLIMETRES_EXTENT, int(Notice.SUSPECTED_MILLIMETRES), 0)
+    return huge | np.where(late, int(Notice.NON_POSITIVE_DT), 0)
+
+
+def _to_side(state: State, notice: Array) -> HandPose:
+    """The output as the hand's own side has it, in arrays of the caller's own."""
+    pose = state.pose
+    back = {
+        "markers": mirror,
+        "wrist_rotation": mirror_rotation,
+        "wrist_position": mirror,
+        "rotations": mirror_rotation,
+        "positions": mirror,
+    }
+    fields: dict[str, Any] = {}
+    for name, value in pose._asdict().items():
+        if name in back and value is not None:
+            right = state.right.reshape(state.right.shape + (1,) * (value.ndim - state.right.ndim))
+            fields[name] = np.where(right, back[name](value), value)
+        else:
+            fields[name] = None if value is None else value.copy()
+    return HandPose(**fields | {"notice": notice})
+
+
+def _where(condition: Array, yes: Any, no: Any) -> Any:
+    """`np.where` over equal nested tuples; `condition [...]` is broadcast from the left."""
+    if isinstance(yes, tuple):
+        parts = [_where(condition, a, b) for a, b in zip(yes, no, strict=True)]
+        return type(yes)(*parts) if parts else yes
+    if yes is None:
+        return None
+    shape = condition.shape + (1,) * (yes.ndim - condition.ndim)
+    return np.where(condition.reshape(shape), yes, no)
+
+
+class HandTracker:
+    """One hand, or several of one model, frame by frame: `init` and `step` with the state inside.
+
+    `tracker = HandTracker.load("model.npz"); pose = tracker.step(markers, dt)`
+    """
+
+    def __init__(self, model: Model, *, right: bool | Sequence[bool] = False) -> None:
+        """`right`: True for a right hand; a sequence, one entry a hand, for several hands.
+
+        Raises:
+            ValueError: the model's predictor is not known.
+        """
+        self.model = model
+        self._right = np.asarray(right, bool)
+        self._state = init(model, self._right.shape, self._right)
+
+    @classmethod
+    def load(cls, path: str | Path, *, right: bool | Sequence[bool] = False) -> HandTracker:
+        """A tracker that runs a model file.
+
+        Raises:
+            ValueError: the file is not a model, or a damaged one; see `model.load`.
+        """
+        return cls(load(path), right=right)
+
+    @property
+    def hand(self) -> Hand:
+        """The model's hand: marker names in their order, template, skeleton."""
+        return self.model.hand
+
+    def reset(self) -> None:
+        """Forgets all that was seen."""
+        self._state = init(self.model, self._right.shape, self._right)
+
+    def step(self, markers: Array, dt: Array, visible: Array | None = None) -> HandPose:
+        """Takes in one frame and gives back the whole hand.
+
+        Args:
+            markers: `[M, 3]` (several hands: `[hands, M, 3]`) metres, world, in the order of
+                `hand.markers`; NaN where a marker is hidden.
+            dt: seconds since the previous frame.
+            visible: `[M]` True where measured, if NaN is not to say it.
+
+        Raises:
+            ValueError: a wrong shape. Wrong data never raise; they show in the output's `state`,
+                `status` and `notice`.
+        """
+        markers = np.asarray(markers, np.float64)
+        expected = (*self._right.shape, len(self.hand), 3)
+        if markers.shape != expected:
+            raise ValueError(f"markers: expected shape {expected}, received {markers.shape}")
+        shown = np.ones(expected[:-1], bool) if visible is None else np.asarray(visible, bool)
+        if shown.shape != expected[:-1]:
+            raise ValueError(f"visible: expected shape {expected[:-1]}, received {shown.shape}")
+        elapsed = np.broadcast_to(np.asarray(dt, np.float64), self._right.shape)
+        self._state, pose = step(self.model, self._state, markers, shown, elapsed)
+        return pose
