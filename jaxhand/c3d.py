@@ -33,6 +33,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         time=np.arange(frames) / rate,
         rate=rate,
         source=str(path),
+        unit=scale,
     )
     return recording.reflected() if left_handed else recording
 

@@ -5,6 +5,8 @@ Points are rows, rotations act on columns: `world = hand @ rotation.T + translat
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +21,17 @@ def product(a: Array, b: Array) -> Array:
     """Matrix product of small matrices as multiply and sum: XLA fuses it, where batched `dot` is a
     call for each matrix, and it stays float32 on devices whose `dot` would round to less."""
     return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
+
+
+def inner(a: Array, b: Array) -> Array:
+    """`[..., N, i]`, `[..., N, j]` → `[..., i, j]`: sums over the points."""
+    return jnp.einsum("...ni,...nj->...ij", a, b, precision="highest")
+
+
+def apart(values: Any) -> Any:
+    """The same values, computed once. XLA's fusion on the CPU would otherwise compute what leads to
+    a small matrix again for each use of each of its entries, ten to fifty times over."""
+    return jax.lax.optimization_barrier(values)
 
 
 def mirror(points: Array) -> Array:
@@ -38,9 +51,9 @@ def centre(points: Array, weight: Array) -> tuple[Array, Array]:
     Centred twice: the first mean is rounded at the size of world coordinates, and in float32 that
     alone would lift three points out of their own plane.
     """
-    mean = mean_point(points, weight)
-    centred = points - mean[..., None, :]
-    return centred - mean_point(centred, weight)[..., None, :], mean
+    mean = apart(mean_point(points, weight))
+    centred = apart(points - mean[..., None, :])
+    return apart(centred - mean_point(centred, weight)[..., None, :]), mean
 
 
 def transform(rotation: Array, translation: Array, points: Array) -> Array:
@@ -64,7 +77,7 @@ def second_extent(points: Array, weight: Array) -> Array:
     collinear points. The largest eigenvalue of the 3×3 scatter stands in closed form (Smith 1961);
     the second comes from it, trace and determinant: Smith's is 3 mm for a 20 cm line in float32."""
     centred = (points - mean_point(points, weight)[..., None, :]) * jnp.sqrt(weight)[..., None]
-    scatter = product(jnp.swapaxes(centred, -1, -2), centred)
+    scatter = apart(inner(centred, centred))
     mean = (scatter[..., 0, 0] + scatter[..., 1, 1] + scatter[..., 2, 2]) / 3
     deviation = scatter - mean[..., None, None] * jnp.eye(3, dtype=scatter.dtype)
     radius = jnp.sqrt((deviation * deviation).sum((-1, -2)) / 6)
@@ -118,11 +131,13 @@ def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[A
         `rotation [..., 3, 3]` with determinant +1, `translation [..., 3]`. Without points the
         translation is 0.
     """
-    source_mean, target_mean = mean_point(source, weight), mean_point(target, weight)
+    source_mean, target_mean = apart((mean_point(source, weight), mean_point(target, weight)))
     centred = (target - target_mean[..., None, :]) * weight[..., None]
-    covariance = product(jnp.swapaxes(centred, -1, -2), source - source_mean[..., None, :])
-    rotation = nearest_rotation(covariance + prior_weight(covariance)[..., None, None] * prior)
-    return rotation, target_mean - product(rotation, source_mean[..., None])[..., 0]
+    covariance = apart(inner(centred, source - source_mean[..., None, :]))
+    weighed = apart(covariance + prior_weight(covariance)[..., None, None] * prior)
+    rotation = apart(nearest_rotation(weighed))
+    moved = product(rotation, source_mean[..., None])[..., 0]
+    return apart((rotation, target_mean - moved))
 
 
 def prior_weight(covariance: Array) -> Array:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from jaxhand.geometry import centre, kabsch, product, solve, transform, untransform
+from jaxhand.geometry import apart, centre, inner, kabsch, product, solve, transform, untransform
 from jaxhand.networks import predict
 from numpy_infer.arrays import Array
 from numpy_infer.model import Model
@@ -153,11 +153,11 @@ def affine_combination(frame: Array, weight: Array, markers: Array) -> tuple[Arr
     then, then_mean = centre(frame, weight)
     now, now_mean = centre(markers[..., None, :, :], weight)
     then = then * weight[..., None]
-    scatter = product(jnp.swapaxes(then, -1, -2), then)
+    scatter = apart(inner(then, then))
     ridge = (RIDGE * jnp.eye(3)).astype(markers.dtype)
-    coefficients = solve(scatter + ridge, own - then_mean)
-    change = product(jnp.swapaxes(now, -1, -2), product(then, coefficients[..., None]))
-    return now_mean + change[..., 0], weight.any(-1)
+    coefficients = apart(solve(scatter + ridge, own - then_mean))
+    shares = apart(product(then, coefficients[..., None]))
+    return now_mean + inner(now, shares)[..., 0], weight.any(-1)
 
 
 def learned_init(model: Model, batch: tuple[int, ...] = ()) -> tuple[()]:

@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxhand.geometry import (
+    apart,
     kabsch,
     mean_point,
     mirror,
@@ -134,21 +135,23 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     fresh = tracking & ~state.tracked
     both = visible & state.visible
     shift = mean_point(markers - state.markers, both.astype(markers.dtype))
-    rotation, translation = _register(state, template, markers, weight, tracking, shift)
+    rotation, translation = apart(_register(state, template, markers, weight, tracking, shift))
     # Before there was any output the template stands in for it.
     placed = transform(rotation, translation, template)
     last = jnp.where(state.tracked[..., None, None], state.pose.markers, placed)
-    advance, raw = _fill(
-        model, state.predictor, markers, visible, last, dt, (rotation, translation)
+    advance, raw = apart(
+        _fill(model, state.predictor, markers, visible, last, dt, (rotation, translation))
     )
     held = jnp.where(state.tracked[..., None, None], last + shift[..., None, :], placed)
     raw = jnp.where(tracking[..., None, None], raw, held)
     raw = jnp.where(visible[..., None], markers, raw)
-    registered = untransform(rotation, translation, raw)
+    registered = apart(untransform(rotation, translation, raw))
 
     changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
     correction, anchor, seen = state.correction, state.anchor, state.seen
-    redone = _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
+    redone = apart(
+        _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
+    )
     restart = (changed & state.tracked)[..., None, None]
     correction = jnp.where(restart, redone[0], correction)
     anchor = jnp.where(restart, redone[1], anchor)
@@ -158,6 +161,7 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     anchor = jnp.where(begin, registered, anchor)
     seen = jnp.where(begin & ~visible[..., None], template, seen)
     seen = jnp.where(visible[..., None], registered, seen)
+    correction, anchor, seen = apart((correction, anchor, seen))
 
     if model.continuity:
         correction, blend = _blend(model, correction, anchor, registered, visible, tracking, dt)
@@ -237,10 +241,10 @@ def _redo(
     template = jnp.asarray(model.hand.template, dtype)
     before = transform(state.rotation, state.translation, state.seen)
     before = jnp.where(state.visible[..., None], state.markers, before)
-    turn, move = _motion(state, before, markers, visible, tracking, shift)
+    turn, move = apart(_motion(state, before, markers, visible, tracking, shift))
     returned = untransform(turn, move, markers)
     returned = jnp.where(state.visible[..., None], state.markers, returned)
-    previous: Array = jnp.where(visible[..., None], returned, 0)
+    previous: Array = apart(jnp.where(visible[..., None], returned, 0))
     found = kabsch(template, previous, visible.astype(dtype), rotation)
     then_rotation = jnp.where(tracking[..., None, None], found[0], state.rotation)
     then_translation = jnp.where(tracking[..., None], found[1], state.translation)

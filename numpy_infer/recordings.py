@@ -75,7 +75,9 @@ class Recording:
     time: [T] seconds, finite; it need not increase.
     rate: Hz, from the file, else the median of 1 / diff(time).
     source: the path that it came from.
+    unit: metres in one unit of the file.
     joints: joint truth, if the file has any.
+    angles: [T, 26] radians, in the order of `hand.ANGLES`: what tracking made of the markers.
     filled: names whose values are partly made up by the recording software (gap filling).
     notes: one-line things that the reader wants the user to know.
     """
@@ -85,7 +87,9 @@ class Recording:
     time: np.ndarray
     rate: float
     source: str
+    unit: float = 1.0
     joints: JointTruth | None = None
+    angles: np.ndarray | None = None
     filled: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 

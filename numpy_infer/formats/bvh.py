@@ -65,6 +65,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         time=np.arange(len(positions)) * bvh.frame_time,
         rate=1.0 / bvh.frame_time,
         source=str(path),
+        unit=scale,
         joints=JointTruth(bvh.names, positions * scale, rotations),
         notes=bvh.notes,
     )

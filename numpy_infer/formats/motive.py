@@ -56,6 +56,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         time=time,
         rate=_rate(file, settings),
         source=str(path),
+        unit=scale,
         notes=file.notes + _left_out(headings),
     )
     return recording.reflected() if left_handed else recording

@@ -27,6 +27,7 @@ from numpy_infer.formats.table import (
     read_text,
 )
 from numpy_infer.formats.units import agreed, metres_per
+from numpy_infer.hand import ANGLES
 from numpy_infer.recordings import Recording, median_rate
 
 
@@ -51,23 +52,28 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         time=time,
         rate=rate,
         source=str(path),
+        unit=scale,
         notes=file.notes + notes,
     )
     return recording.reflected() if left_handed else recording
 
 
 def write(recording: Recording, path: Path) -> None:
-    """Write metres with every digit; gaps are blank."""
+    """Write metres with every digit, and degrees where there are angles; gaps are blank."""
     check_writable(recording.names)
     columns = [f"{name}.{axis}" for name in recording.names for axis in "xyz"]
+    markers = np.where(recording.visible[..., None], recording.markers, np.nan)
+    table = markers.reshape(len(markers), -1)
+    if recording.angles is not None:
+        columns += [f"{angle.name}.deg" for angle in ANGLES]
+        table = np.concatenate([table, np.degrees(recording.angles)], -1)
     lines = [
         "# unit: m",
         f"# rate: {number(recording.rate)}",
         f"# frames: {len(recording.time)}",
         ",".join(["time", *columns]),
     ]
-    markers = np.where(recording.visible[..., None], recording.markers, np.nan)
-    for time, row in zip(recording.time, markers.reshape(len(markers), -1).tolist(), strict=True):
+    for time, row in zip(recording.time, table.tolist(), strict=True):
         cells = ["" if value != value else number(value) for value in row]
         lines.append(",".join([number(time), *cells]))
     path.write_text("".join(line + "\n" for line in lines), "utf-8", newline="\n")

@@ -54,6 +54,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         time=time,
         rate=rate,
         source=str(path),
+        unit=scale,
         filled=filled,
         notes=file.notes + notes,
     )

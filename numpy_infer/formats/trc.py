@@ -45,6 +45,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         time=table[:, 1],
         rate=positive(settings["DataRate"], file.where(2), "DataRate"),
         source=str(path),
+        unit=scale,
         notes=file.notes + left_out + notes,
     )
     return recording.reflected() if left_handed else recording

@@ -1,0 +1,316 @@
+"""How good a model is: Table 3 by the paper's protocol, the joint stage, intervals.
+
+Table 3 (paper, section 6.2.1): everything is visible up to a frame, then k random markers are
+hidden for a duration; the error is the mean distance of the hidden markers to the truth on the last
+hidden frame. Every admissible start is taken, with several seeds.
+
+The tracker's real `step` runs: through the 20 visible frames one by one, then at once to the last
+hidden frame. Nothing in tracker or predictors moves in the frames between, because the visible set
+stays as it is; a test holds this shortcut against the frame-by-frame run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxhand import sequences as data
+from jaxhand import tracker
+from jaxhand.skeleton import forward_kinematics, rotations_from_angles
+from numpy_infer.arrays import Array
+from numpy_infer.hand import CHAINS
+from numpy_infer.model import Model
+
+COUNTS = (1, 2, 3, 4)
+"""Markers hidden at once."""
+
+DURATIONS = (0.1, 0.2, 0.5, 1.0, 2.0)
+"""Seconds hidden."""
+
+VISIBLE_BEFORE = 20
+"""Frames that are visible before the gap."""
+
+SEEDS = 5
+
+BLOCK_SECONDS = 4.0
+"""Length of a block of the bootstrap; both hands of a take are in one block."""
+
+RESAMPLINGS, FEWEST_BLOCKS = 1000, 10
+
+CHUNK = 4096
+"""Trials run at once: a compromise of memory and speed, and one shape to compile for."""
+
+MEASURED_POINTS = np.array([point for chain in CHAINS for point in chain[1:]])
+"""`[15]` PIP, DIP and tip of the fingers; MCP, IP and tip of the thumb."""
+
+Cell = dict[str, Any]
+Report = Callable[[str, float], None]
+
+
+class Starts(NamedTuple):
+    """Where trials may begin, among the frames of all sequences put end to end."""
+
+    frames: Array
+    """`[F, M, 3]` metres: all sequences, one after the other."""
+    start: Array
+    """`[N]` index of the last visible frame of each start."""
+    room: Array
+    """`[N]` how many complete frames of the same sequence follow it."""
+    block: Array
+    """`[N]` bootstrap block that it lies in."""
+
+
+def methods(model: Model) -> dict[str, Model]:
+    """The rows of Table 3 for a model: the baselines on its hand, and what it has learned."""
+    rows = {
+        name: replace(model, predictor=name, joints="none")
+        for name in ("last_known", "moving_average", "affine")
+    }
+    if model.marker_network is not None:
+        learned = replace(model, predictor="learned", joints="none")
+        rows |= {"learned": learned, "learned_no_offset": replace(learned, continuity=False)}
+    return rows
+
+
+def table3(
+    models: Mapping[str, Model],
+    sequences: Sequence[data.Sequence],
+    *,
+    seeds: int = SEEDS,
+    report: Report = lambda name, share: None,
+) -> dict[str, dict[str, dict[str, Cell]]]:
+    """Marker error of each model, `{METHOD: {"1".."4": {"0.1".."2.0": CELL}}}`.
+
+    Args:
+        models: name → model; all for the same markers.
+        sequences: what to test on, at 60 Hz.
+        seeds: how many times every start is taken, with other markers hidden.
+        report: is told the method at work and the share of its trials done.
+
+    Returns:
+        CELL is `mean`, `low`, `high` in cm (95 % block bootstrap; None with fewer than 10 blocks)
+        and `n`, the number of trials.
+
+    Raises:
+        ValueError: no sequence has 20 complete frames and the shortest gap after them.
+    """
+    starts = find_starts(sequences)
+    return {
+        name: _table_of(model, starts, seeds, lambda share, name=name: report(name, share))
+        for name, model in models.items()
+    }
+
+
+def find_starts(sequences: Sequence[data.Sequence]) -> Starts:
+    """Every frame with 20 complete frames up to it and room for the shortest gap after it."""
+    frames, start, room, block, offset = [], [], [], [], 0
+    takes: dict[tuple[str, int], int] = {}
+    for sequence in sequences:
+        complete = np.isfinite(sequence.markers).all((-1, -2))
+        before, after = _runs(complete), _runs(complete[::-1])[::-1]
+        shortest = round(sequence.rate * DURATIONS[0])
+        good = np.flatnonzero((before >= VISIBLE_BEFORE) & (after - 1 >= shortest))
+        frames.append(np.nan_to_num(np.asarray(sequence.markers, np.float32)))
+        start.append(good + offset)
+        room.append(after[good] - 1)
+        blocks = (good / (sequence.rate * BLOCK_SECONDS)).astype(int)
+        keys = [(sequence.take, int(b)) for b in blocks]
+        block.append(np.array([takes.setdefault(key, len(takes)) for key in keys], int))
+        offset += len(complete)
+    if not sum(map(len, start)):
+        raise ValueError(
+            f"nothing to test on: expected at least {VISIBLE_BEFORE} frames with all markers "
+            f"and {DURATIONS[0]} s after them, in one of {len(sequences)} sequences"
+        )
+    return Starts(*(np.concatenate(arrays) for arrays in (frames, start, room, block)))
+
+
+def hide(rng: np.random.Generator, trials: int, markers: int, count: int) -> Array:
+    """`[trials, markers]` True at `count` random markers of each trial."""
+    rank = rng.random((trials, markers)).argsort(-1).argsort(-1)
+    return rank < count
+
+
+def interval(total: Array, count: Array) -> Cell:
+    """Mean with its 95 % interval by block bootstrap.
+
+    Args:
+        total: `[blocks]` sum of the samples in each block.
+        count: `[blocks]` their number.
+    """
+    total, count = total[count > 0], count[count > 0]
+    cell: Cell = {"mean": None, "low": None, "high": None, "n": int(count.sum())}
+    if len(count):
+        cell["mean"] = float(total.sum() / count.sum())
+    if len(count) >= FEWEST_BLOCKS:
+        drawn = np.random.default_rng(0).integers(len(count), size=(RESAMPLINGS, len(count)))
+        means = total[drawn].sum(-1) / count[drawn].sum(-1)
+        cell["low"], cell["high"] = (float(q) for q in np.quantile(means, (0.025, 0.975)))
+    return cell
+
+
+def mean_ratio(table: Mapping[str, Any], method: str, rival: str) -> float:
+    """Mean over the cells of Table 3 of one method's error over another's."""
+    ratios = [
+        cell["mean"] / table[rival][count][duration]["mean"]
+        for count, row in table[method].items()
+        for duration, cell in row.items()
+        if cell["mean"] is not None
+    ]
+    return float(np.mean(ratios))
+
+
+def joint_errors(model: Model, dataset: data.Dataset) -> dict[str, dict[str, Cell]]:
+    """The joint stage with nothing hidden, `{METHOD: {"cm", "deg", "wrist_mm", "wrist_deg"}}`.
+
+    `cm` is the mean distance of PIP, DIP and tip (thumb: MCP, IP, tip) to the truth, through the
+    whole pipeline, wrist pose and the model's own bone lengths included; `deg` the mean angle error
+    over the angles that the data determine. `learned` is the model, `mean_pose` the same with the
+    mean angles of its training data, whatever the markers say.
+
+    Raises:
+        ValueError: the model has no joint network, or the data no joint truth.
+    """
+    if model.joint_network is None:
+        raise ValueError("the model has no joint network")
+    frames = data.complete_frames(dataset)
+    if frames.angles is None:
+        raise ValueError(f"data set {dataset.name!r} has no joint truth")
+    observed = dataset.observed_angles
+    observed = np.ones(frames.angles.shape[-1], bool) if observed is None else observed
+    poses = _poses(replace(model, predictor="affine", joints="learned"), frames.markers)
+    mean_angles = np.broadcast_to(model.joint_network.output_mean, frames.angles.shape)
+    mean_positions = _positions(model, mean_angles, poses.wrist_rotation, poses.wrist_position)
+    blocks = _frame_blocks(dataset, frames)
+    truth = frames.rotations[:, 0]
+    turn = np.einsum("nij,nij->n", poses.wrist_rotation, truth)
+    wrist = {
+        "wrist_mm": 1e3 * np.linalg.norm(poses.wrist_position - frames.positions[:, 0], axis=-1),
+        "wrist_deg": np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1))),
+    }
+    rows = {"learned": (poses.angles, poses.positions), "mean_pose": (mean_angles, mean_positions)}
+    result = {}
+    for name, (angles, positions) in rows.items():
+        distance = np.linalg.norm(positions - frames.positions, axis=-1)[:, MEASURED_POINTS]
+        turned = np.abs(np.degrees(angles - frames.angles))[:, observed]
+        values = {"cm": 1e2 * distance.mean(-1), "deg": turned.mean(-1), **wrist}
+        result[name] = {key: _interval_of(value, blocks) for key, value in values.items()}
+    return result
+
+
+def _runs(complete: Array) -> Array:
+    """`[T]` length of the run of True that ends at each frame."""
+    count = np.cumsum(complete)
+    broken = np.maximum.accumulate(np.where(complete, 0, count))
+    return np.where(complete, count - broken, 0)
+
+
+def _table_of(
+    model: Model, starts: Starts, seeds: int, report: Callable[[float], None]
+) -> dict[str, dict[str, Cell]]:
+    blocks = int(starts.block.max()) + 1
+    total = np.zeros((len(COUNTS), len(DURATIONS), blocks))
+    number = np.zeros(total.shape, int)
+    chunks = range(0, len(starts.start), CHUNK)
+    for done, first in enumerate(chunks):
+        report(done / len(chunks))
+        part = Starts(starts.frames, *(array[first : first + CHUNK] for array in starts[1:]))
+        state = _visible_until(model, part)
+        for i, count in enumerate(COUNTS):
+            for j, duration in enumerate(DURATIONS):
+                for seed in range(seeds):
+                    rng = np.random.default_rng([seed, count, j, first])
+                    error, block = _errors(model, state, part, count, duration, rng)
+                    total[i, j] += np.bincount(block, error, blocks)
+                    number[i, j] += np.bincount(block, minlength=blocks)
+    report(1.0)
+    return {
+        str(count): {
+            f"{duration:.1f}": interval(total[i, j], number[i, j])
+            for j, duration in enumerate(DURATIONS)
+        }
+        for i, count in enumerate(COUNTS)
+    }
+
+
+def _visible_until(model: Model, starts: Starts) -> Any:
+    """The tracker's state at each start, after 20 visible frames."""
+    state = tracker.init(model, (CHUNK,))
+    visible = jnp.ones((CHUNK, len(model.hand)), bool)
+    for back in range(VISIBLE_BEFORE - 1, -1, -1):
+        markers = starts.frames[_padded(starts.start) - back]
+        state, _ = _step(model, state, markers, visible, jnp.full(CHUNK, 1 / data.RATE))
+    return state
+
+
+def _errors(
+    model: Model, state: Any, starts: Starts, count: int, duration: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Mean error of the hidden markers in cm, and the block, of each admissible trial."""
+    frames = round(data.RATE * duration)
+    hidden = hide(rng, len(starts.start), len(model.hand), count)
+    admissible = starts.room >= frames
+    last = starts.start + np.where(admissible, frames, 0)
+    truth = starts.frames[_padded(last)]
+    visible = ~_padded(hidden)
+    _, output = _step(model, state, truth, visible, jnp.full(CHUNK, duration))
+    distance = np.linalg.norm(np.asarray(output) - truth, axis=-1)[: len(hidden)]
+    error = 1e2 * (distance * hidden).sum(-1) / count
+    return error[admissible], starts.block[admissible]
+
+
+def _padded(values: Array) -> Array:
+    """`[n, ...]` → `[CHUNK, ...]`, the last one repeated."""
+    return values[np.minimum(np.arange(CHUNK), len(values) - 1)]
+
+
+@jax.jit
+def _step(model: Model, state: Any, markers: Array, visible: Array, dt: Array) -> tuple[Any, Array]:
+    # What is hidden does not get as far as the tracker, so no predictor can read it.
+    markers = jnp.where(visible[..., None], markers, jnp.nan)
+    state, pose = tracker.step(model, state, markers, visible, dt)
+    return state, pose.markers
+
+
+@jax.jit
+def _first_pose(model: Model, markers: Array) -> Any:
+    batch = markers.shape[:-2]
+    visible = jnp.ones(markers.shape[:-1], bool)
+    return tracker.step(model, tracker.init(model, batch), markers, visible, jnp.zeros(batch))[1]
+
+
+def _poses(model: Model, markers: Array) -> Any:
+    """The tracker's output on complete frames `[N, M, 3]`, each as a first frame."""
+    parts = []
+    for first in range(0, len(markers), CHUNK):
+        part = markers[first : first + CHUNK]
+        pose = _first_pose(model, jnp.asarray(_padded(part), jnp.float32))
+        parts.append(jax.tree.map(lambda a, n=len(part): np.asarray(a)[:n], pose))
+    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+
+
+@jax.jit
+def _positions(model: Model, angles: Array, rotation: Array, position: Array) -> Array:
+    local = rotations_from_angles(angles)
+    skeleton = jnp.asarray(model.hand.skeleton, angles.dtype)
+    return forward_kinematics(skeleton, local, rotation, position)[0]
+
+
+def _frame_blocks(dataset: data.Dataset, frames: data.CompleteFrames) -> Array:
+    takes: dict[tuple[str, int], int] = {}
+    blocks = []
+    for i, sequence in enumerate(dataset.sequences):
+        length = sequence.rate * BLOCK_SECONDS
+        number = np.arange((frames.sequence == i).sum())
+        keys = [(sequence.take, int(n / length)) for n in number]
+        blocks.append(np.array([takes.setdefault(key, len(takes)) for key in keys], int))
+    return np.concatenate(blocks)
+
+
+def _interval_of(values: Array, blocks: Array) -> Cell:
+    return interval(np.bincount(blocks, values), np.bincount(blocks))

@@ -1,0 +1,100 @@
+"""Finishes a trained model and writes it to a file that the numpy runtime is seen to run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxhand import evaluation
+from jaxhand.networks import predict
+from jaxhand.sequences import Sequence as MarkerSequence
+from numpy_infer import model as model_file
+from numpy_infer import networks
+from numpy_infer.model import Model
+from numpy_infer.networks import Network
+
+FADES = (0.01, 0.02, 0.03, 0.04, 0.06, 0.1)
+"""Metres: values of δ that are tried on validation."""
+
+PARITY = 1e-4
+"""Largest difference between JAX and numpy outputs, relative to the spread of the outputs: what
+float32 leaves after four layers, with room."""
+
+
+def finish(
+    model: Model,
+    sequences: Sequence[MarkerSequence],
+    report: Callable[[str], None] = lambda text: None,
+) -> Model:
+    """Chooses δ of the continuity blend and measures the table of expected errors, both on
+    validation sequences. A model without a marker network, or sequences too short, stay as is."""
+    if model.marker_network is None:
+        return model
+    try:
+        evaluation.find_starts(sequences)
+    except ValueError as error:
+        report(f"fade and expected error keep their defaults: {error}")
+        return model
+    learned = replace(model, predictor="learned", joints="none")
+    tables = {
+        fade: evaluation.table3({"": replace(learned, fade=fade)}, sequences, seeds=1)[""]
+        for fade in FADES
+    }
+    means = {fade: _means(table) for fade, table in tables.items()}
+    fade = min(FADES, key=lambda fade: np.nanmean(means[fade]))
+    report(f"fade δ = {1e3 * fade:.0f} mm")
+    # Where validation is too short for the longest gaps, the last measured one stands for them.
+    filled = means[fade].copy()
+    for column in range(1, filled.shape[1]):
+        missing = np.isnan(filled[:, column])
+        filled[missing, column] = filled[missing, column - 1]
+    table = np.concatenate([np.zeros((len(filled), 1)), 1e-2 * filled], -1)
+    return replace(model, fade=fade, expected_error=table)
+
+
+def _means(table: dict[str, dict[str, evaluation.Cell]]) -> np.ndarray:
+    """`[counts, durations]` cm; NaN where there was no trial."""
+    rows = [
+        [np.nan if c["mean"] is None else c["mean"] for c in row.values()] for row in table.values()
+    ]
+    return np.array(rows)
+
+
+def export(model: Model, path: str | Path, *, overwrite: bool = False) -> Model:
+    """Writes a model file, reads it back with numpy and holds its outputs against JAX's.
+
+    Returns:
+        The model as read back.
+
+    Raises:
+        ValueError: the file exists and `overwrite` is False; or the outputs differ, which leaves
+            no file behind.
+    """
+    path = Path(path)
+    model_file.save(model, path, overwrite=overwrite)
+    back = model_file.load(path)
+    for name in ("marker_network", "joint_network"):
+        trained, read = getattr(model, name), getattr(back, name)
+        if trained is not None and (difference := _difference(trained, read)) > PARITY:
+            path.unlink()
+            raise ValueError(
+                f"{name}: numpy and JAX differ by {difference:.1e} of the outputs' spread, "
+                f"expected at most {PARITY:.0e}"
+            )
+    return back
+
+
+def _difference(trained: Network, read: Network) -> float:
+    """Largest difference between the two, on random inputs with a third of them hidden, relative
+    to the spread of the outputs."""
+    rng = np.random.default_rng(0)
+    size = (256, len(read.input_mean))
+    inputs = read.input_mean + read.input_scale * rng.standard_normal(size).astype(np.float32)
+    known = rng.random(size) > 1 / 3
+    jax_side = np.asarray(jax.jit(predict)(trained, inputs, known))
+    numpy_side = networks.predict(read, inputs, known)
+    return float(np.abs(jax_side - numpy_side).max() / max(numpy_side.std(), 1e-9))

@@ -1,0 +1,273 @@
+"""The command `jaxhand`: the verbs that need numpy alone; hands the others over to the JAX side."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from importlib.metadata import entry_points, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from numpy_infer.hand import Hand, bundled, load_hand
+from numpy_infer.model import Model, load
+from numpy_infer.pose import Status, TrackingState
+from numpy_infer.predictors import PREDICTORS
+from numpy_infer.recordings import Recording, load_label_map, read, write
+from numpy_infer.tracking import Tracked, track
+
+VERBS = {
+    "train": "train both networks on recordings of hands",
+    "evaluate": "measure a model beside the baselines (the paper's Table 3)",
+    "demo": "the whole line on simulated hands, in a few minutes and with no data",
+}
+"""Verbs of the JAX side, found through the entry points `jaxhand.verbs`."""
+
+BASELINES = ("last_known", "moving_average", "affine")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs one command; returns the exit status: 0, or 2 after one line on stderr."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    if arguments and arguments[0] in VERBS:
+        return _hand_over(arguments[0], arguments[1:])
+    options = parser().parse_args(arguments)
+    try:
+        run: Callable[[argparse.Namespace], None] = options.run
+        run(options)
+    except (ValueError, OSError) as error:
+        print(f"jaxhand {options.verb}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"\njaxhand {options.verb}: stopped; no file was changed", file=sys.stderr)
+        return 130
+    return 0
+
+
+def parser() -> argparse.ArgumentParser:
+    """The command line of the numpy side."""
+    top = argparse.ArgumentParser(
+        prog="jaxhand",
+        description="Tracks hands from labelled optical markers, with holes.",
+        epilog="jaxhand VERB --help tells more. " + _sources(),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    top.add_argument("--version", action="version", version=version("jaxhand"))
+    verbs = top.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    inspect = verbs.add_parser(
+        "inspect",
+        help="what is in a marker file, and which hand fits it",
+        description="Prints labels, rate, unit, the gaps of every marker, and which bundled hand "
+        "fits. Example: jaxhand inspect take.trc",
+    )
+    _add_file(inspect)
+    inspect.add_argument("--json", action="store_true", help="print JSON instead of text")
+    inspect.set_defaults(run=_inspect)
+
+    tracked = verbs.add_parser(
+        "track",
+        help="fill the holes of a recording, and solve the joints",
+        description="Runs the tracker over a recording and writes all markers; a .csv also holds "
+        "the joint angles. Example: jaxhand track take.trc --model model.npz -o filled.csv",
+    )
+    _add_file(tracked)
+    tracked.add_argument(
+        "--model",
+        required=True,
+        metavar="M",
+        help=f"a model file, or a baseline that needs none: {', '.join(BASELINES)}",
+    )
+    tracked.add_argument("-o", "--output", required=True, type=Path, help="OUT.trc, .tsv or .csv")
+    tracked.add_argument(
+        "--hand",
+        help=f"for a baseline: a hand file, or one of {', '.join(bundled())}; default the one "
+        "that fits the labels",
+    )
+    tracked.add_argument("--right", action="store_true", help="it is a right hand")
+    tracked.add_argument(
+        "--predictor", choices=tuple(PREDICTORS), help="instead of the model's; none: fill nothing"
+    )
+    tracked.add_argument("--joints", choices=("learned", "none"), help="instead of the model's")
+    tracked.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
+    tracked.set_defaults(run=_track)
+
+    hands = verbs.add_parser(
+        "hands",
+        help="the hands that come with the package",
+        description="Lists the bundled hands with their markers; with a NAME prints its file, to "
+        "start a hand of your own from. Example: jaxhand hands glove9 > my_glove.json",
+    )
+    hands.add_argument("name", nargs="?", help="print this hand's file")
+    hands.set_defaults(run=_hands)
+    for verb, text in VERBS.items():
+        verbs.add_parser(verb, help=text, add_help=False)
+    return top
+
+
+def _add_file(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("file", type=Path, help="TRC, Qualisys TSV, CSV, Motive CSV, BVH, C3D, …")
+    verb.add_argument("--map", type=Path, help='JSON file {"label in the file": "marker"}')
+    verb.add_argument("--unit", type=float, help="metres per unit, where the file does not say")
+    verb.add_argument(
+        "--left-handed", action="store_true", help="the file's coordinates are left-handed"
+    )
+
+
+def _read(options: argparse.Namespace) -> Recording:
+    return read(
+        options.file,
+        unit=options.unit,
+        left_handed=options.left_handed,
+        label_map=load_label_map(options.map) if options.map else None,
+    )
+
+
+def _inspect(options: argparse.Namespace) -> None:
+    recording = _read(options)
+    report = describe(recording)
+    if options.json:
+        print(json.dumps(report, indent=1))
+        return
+    print(f"{report['file']}: {report['frames']} frames, {report['seconds']:.1f} s")
+    print(f"rate {report['rate']:g} Hz, file unit {report['unit_m']:g} m")
+    for note in report["notes"]:
+        print(f"note: {note}")
+    width = max(len(name) for name in recording.names)
+    print(f"\n{'marker':{width}}  missing  gaps  longest")
+    for name, marker in report["markers"].items():
+        mark = "  partly filled in by the recording software" if marker["filled"] else ""
+        print(
+            f"{name:{width}}  {100 * marker['missing']:6.1f}%  {marker['gaps']:4d}  "
+            f"{marker['longest_s']:6.2f}s{mark}"
+        )
+    print()
+    for name, missing in report["hands"].items():
+        lacks = f"lacks {', '.join(missing)}" if missing else "fits"
+        print(f"hand {name}: {lacks}")
+
+
+def describe(recording: Recording) -> dict[str, Any]:
+    """What `jaxhand inspect --json` prints: plain data about a recording and its gaps."""
+    visible = recording.visible
+    markers = {}
+    for name, seen in zip(recording.names, visible.T, strict=True):
+        edges = np.flatnonzero(np.diff(np.r_[False, ~seen, False].astype(int)))
+        lengths = edges[1::2] - edges[::2]
+        markers[name] = {
+            "missing": float(1 - seen.mean()),
+            "gaps": len(lengths),
+            "longest_s": float(lengths.max(initial=0) / recording.rate),
+            "filled": name in recording.filled,
+        }
+    return {
+        "file": recording.source,
+        "frames": len(recording.time),
+        "seconds": float(recording.time[-1] - recording.time[0]),
+        "rate": recording.rate,
+        "unit_m": recording.unit,
+        "notes": list(recording.notes),
+        "markers": markers,
+        "hands": {
+            name: [m for m in load_hand(name).markers if m not in recording.names]
+            for name in bundled()
+        },
+    }
+
+
+def _track(options: argparse.Namespace) -> None:
+    if options.output.exists() and not options.overwrite:
+        raise ValueError(f"{options.output} exists: choose another name, or pass --overwrite")
+    recording = _read(options)
+    model = _model(options, recording)
+    if options.predictor:
+        model = replace(model, predictor=options.predictor)
+    if options.joints:
+        model = replace(model, joints=options.joints)
+    show = sys.stderr.isatty()
+
+    def report(share: float) -> None:
+        if show:
+            print(f"\rtracking {100 * share:3.0f} %", end="", file=sys.stderr, flush=True)
+
+    result = track(recording, model, right=options.right, report=report)
+    if show:
+        print(file=sys.stderr)
+    write(result.recording, options.output, overwrite=options.overwrite)
+    print(_summary(result))
+    print(f"wrote {options.output}")
+
+
+def _summary(result: Tracked) -> str:
+    status, state = result.status, result.state
+    lines = [f"{len(state)} frames, {len(result.recording.names)} markers"]
+    for name, text in (
+        (Status.OBSERVED, "measured"),
+        (Status.PREDICTED, "filled from what was seen in the frame"),
+        (Status.HELD, "held: nothing in the frame determined them"),
+    ):
+        lines.append(f"{100 * (status == name).mean():6.2f} % of the markers {text}")
+    hidden = status == Status.PREDICTED
+    if hidden.any():
+        error = 1e3 * result.expected_error[hidden].mean()
+        lines.append(f"filled markers are expected to be {error:.0f} mm off on average")
+    for value, text in ((TrackingState.DEGRADED, "degraded"), (TrackingState.LOST, "lost")):
+        if (state == value).any():
+            lines.append(f"{100 * (state == value).mean():6.2f} % of the frames {text}")
+    return "\n".join(lines)
+
+
+def _model(options: argparse.Namespace, recording: Recording) -> Model:
+    if options.model in BASELINES:
+        return Model(_fitting_hand(options.hand, recording), predictor=options.model)
+    if options.hand:
+        raise ValueError("--hand goes with a baseline; a model file brings its own hand")
+    return load(options.model)
+
+
+def _fitting_hand(name: str | None, recording: Recording) -> Hand:
+    if name:
+        return load_hand(name)
+    fits = [hand for hand in bundled() if set(load_hand(hand).markers) <= set(recording.names)]
+    if not fits:
+        raise ValueError(
+            f"no bundled hand fits the labels {', '.join(recording.names)}: name one with --hand, "
+            "and rename labels with --map"
+        )
+    return max(map(load_hand, fits), key=len)
+
+
+def _hands(options: argparse.Namespace) -> None:
+    if options.name:
+        print(json.dumps(load_hand(options.name).to_json(), indent=1))
+        return
+    for name in bundled():
+        hand = load_hand(name)
+        print(f"{name}: {len(hand)} markers: {', '.join(hand.markers)}")
+
+
+def _hand_over(verb: str, arguments: list[str]) -> int:
+    found = entry_points(group="jaxhand.verbs", name=verb)
+    try:
+        run = next(iter(found)).load()
+    except ImportError as error:
+        print(
+            f"jaxhand {verb} needs more than numpy ({error.name} is not installed): "
+            "pip install 'jaxhand[train]'",
+            file=sys.stderr,
+        )
+        return 2
+    status: int = run(arguments)
+    return status
+
+
+def _sources() -> str:
+    return "Files are read in metres, right-handed; a gap stays a gap until a predictor fills it."
+
+
+if __name__ == "__main__":
+    sys.exit(main())
