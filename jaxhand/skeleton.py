@@ -5,7 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhand.geometry import product
+from jaxhand.geometry import apart, product
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, FINGERS, JOINTS, Hand
 from numpy_infer.skeleton import CROSS, JOINT_AXES, SIGNS, SLOTS
@@ -20,7 +20,7 @@ def rotations_from_angles(angles: Array) -> Array:
     single = eye + jnp.sin(signed) * cross + (1 - jnp.cos(signed)) * product(cross, cross)
     none = jnp.broadcast_to(eye, single[..., :1, :, :].shape)
     single = jnp.concatenate([single, none], -3)
-    first, second, third = (single[..., slot, :, :] for slot in SLOTS)
+    first, second, third = (apart(single)[..., slot, :, :] for slot in SLOTS)
     return product(product(first, second), third)
 
 
@@ -71,7 +71,7 @@ def forward_kinematics(
     turns, places = [], []
     for level in range(3):
         place = place + product(turn, bones[..., level, :, None])[..., 0]
-        turn = product(turn, local[..., level, :, :])
+        turn = apart(product(turn, local[..., level, :, :]))
         turns.append(turn)
         places.append(place)
     tips = place + product(turn, bones[..., 3, :, None])[..., 0]

@@ -1,0 +1,198 @@
+"""Laws of the offline tracker and of the commands that need numpy alone."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from numpy_infer import HandTracker, Model, Status, TrackingState, load_hand
+from numpy_infer.cli import describe, main, parser
+from numpy_infer.recordings import Recording, read, write
+from numpy_infer.tracking import track
+
+HAND = load_hand("glove9")
+
+
+FRAMES = 120
+TIME = np.arange(FRAMES) / 60
+
+
+def true_markers() -> np.ndarray:
+    """`[T, M, 3]` a rigid hand that moves and turns."""
+    zero, one = 0 * TIME, 1 + 0 * TIME
+    rows = (
+        (np.cos(TIME), zero, np.sin(TIME)),
+        (zero, one, zero),
+        (-np.sin(TIME), zero, np.cos(TIME)),
+    )
+    turn = np.stack([np.stack(row, -1) for row in rows], -2)
+    return HAND.template @ np.swapaxes(turn, -1, -2) + np.stack([TIME, one, -TIME], -1)[:, None]
+
+
+def recording_with_gaps() -> Recording:
+    markers = true_markers()
+    markers[40:60, 3] = np.nan
+    markers[50:90, 5:7] = np.nan
+    return Recording(HAND.markers, markers, TIME, 60.0, "made up")
+
+
+def test_offline_equals_live_bit_for_bit() -> None:
+    recording = recording_with_gaps()
+    tracked = track(recording, Model(HAND))
+    tracker = HandTracker(Model(HAND))
+    live = [
+        tracker.step(m, 1 / 60 if i == 0 else recording.time[i] - recording.time[i - 1])
+        for i, m in enumerate(recording.markers)
+    ]
+    assert (tracked.recording.markers == np.array([pose.markers for pose in live])).all()
+    assert (tracked.status == np.array([pose.status for pose in live])).all()
+
+
+def test_a_rigid_hand_is_filled_exactly_by_the_affine_baseline() -> None:
+    recording = recording_with_gaps()
+    tracked = track(recording, Model(HAND))
+    assert np.abs(tracked.recording.markers - true_markers()).max() < 1e-5
+    assert (tracked.state == TrackingState.TRACKING).all()
+    hidden = ~recording.visible
+    assert (tracked.status[hidden] == Status.PREDICTED).all()
+    assert (tracked.expected_error[hidden] > 0).all()
+    assert (tracked.expected_error[~hidden] == 0).all()
+
+
+def test_predictor_none_leaves_gaps_as_they_are() -> None:
+    recording = recording_with_gaps()
+    tracked = track(recording, Model(HAND, predictor="none"))
+    assert (np.isnan(tracked.recording.markers).any(-1) == ~recording.visible).all()
+
+
+def test_frames_before_the_hand_was_tracked_stay_empty() -> None:
+    recording = recording_with_gaps()
+    recording.markers[:7] = np.nan
+    tracked = track(recording, Model(HAND))
+    assert np.isnan(tracked.recording.markers[:7]).all()
+    assert np.isfinite(tracked.recording.markers[7:]).all()
+    assert (tracked.state[:7] == TrackingState.LOST).all()
+
+
+def test_a_wrong_shape_raises_and_wrong_data_do_not() -> None:
+    tracker = HandTracker(Model(HAND))
+    with pytest.raises(ValueError, match=r"expected shape \(9, 3\), received \(8, 3\)"):
+        tracker.step(HAND.template[:8], 1 / 60)
+    with pytest.raises(ValueError, match="visible"):
+        tracker.step(HAND.template, 1 / 60, visible=np.ones(8, bool))
+    pose = tracker.step(np.full((9, 3), np.nan), float("nan"))
+    assert np.isfinite(pose.markers).all()
+    assert pose.state == TrackingState.LOST
+
+
+def test_several_hands_are_several_trackers() -> None:
+    markers = recording_with_gaps().markers
+    pair = HandTracker(Model(HAND), right=[False, True])
+    left, right = HandTracker(Model(HAND)), HandTracker(Model(HAND), right=True)
+    for m in markers:
+        both = pair.step(np.stack([m, m]), np.full(2, 1 / 60))
+        for i, tracker in enumerate((left, right)):
+            one = tracker.step(m, 1 / 60)
+            assert np.allclose(both.markers[i], one.markers, atol=1e-9)
+
+
+def test_track_writes_every_marker_and_leaves_the_input_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source, filled = tmp_path / "take.trc", tmp_path / "filled.trc"
+    write(recording_with_gaps(), source)
+    before = source.read_bytes()
+    assert main(["track", str(source), "--model", "affine", "-o", str(filled)]) == 0
+    assert "% of the markers measured" in capsys.readouterr().out
+    assert np.abs(read(filled).markers - true_markers()).max() < 2e-5
+    assert source.read_bytes() == before
+    assert main(["track", str(source), "--model", "affine", "-o", str(filled)]) == 2
+    assert "pass --overwrite" in capsys.readouterr().err
+    assert main(["track", str(source), "--model", "affine", "-o", str(filled), "--overwrite"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["track", "FILE", "--model", "nothing.npz", "-o", "OUT"], "no model file nothing.npz"),
+        (["track", "FILE", "--model", "affine", "--hand", "dense19", "-o", "OUT"], "ThumbCMC"),
+        (["track", "FILE", "--model", "affine", "--hand", "nobody", "-o", "OUT"], "nobody"),
+        (["track", "none.trc", "--model", "affine", "-o", "OUT"], "none.trc"),
+        (["track", "FILE", "--model", "affine", "-o", "out.xyz"], ".trc"),
+        (["inspect", "none.trc"], "none.trc"),
+        (["hands", "nobody"], "nobody"),
+    ],
+)
+def test_a_mistake_is_one_clear_line(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write(recording_with_gaps(), tmp_path / "take.csv")
+    names = {"FILE": "take.csv", "OUT": "out.trc"}
+    assert main([names.get(a, a) for a in arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out.trc").exists()
+
+
+def test_inspect_counts_gaps_and_finds_the_hand(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = recording_with_gaps()
+    report = describe(recording)
+    assert report["markers"]["ring_tip"] == {
+        "missing": pytest.approx(20 / 120),
+        "gaps": 1,
+        "longest_s": pytest.approx(20 / 60),
+        "filled": False,
+    }
+    assert report["hands"]["glove9"] == []
+    assert "ThumbCMC" in report["hands"]["dense19"]
+    file = tmp_path / "take.csv"
+    write(recording, file)
+    assert main(["inspect", str(file)]) == 0
+    assert "hand glove9: fits" in capsys.readouterr().out
+    assert main(["inspect", str(file), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rate"] == 60
+
+
+def test_a_label_map_renames(tmp_path: Path) -> None:
+    recording = recording_with_gaps().rename({"wrist": "WR"})
+    file, labels, out = tmp_path / "take.csv", tmp_path / "labels.json", tmp_path / "out.csv"
+    write(recording, file)
+    labels.write_text(json.dumps({"WR": "wrist"}))
+    arguments = ["track", str(file), "--model", "affine", "-o", str(out)]
+    assert main(arguments) == 2
+    assert main([*arguments, "--map", str(labels)]) == 0
+    assert read(out).names == HAND.markers
+
+
+def test_every_verb_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb in ("inspect", "track", "hands"):
+        with pytest.raises(SystemExit) as stop:
+            parser().parse_args([verb, "--help"])
+        assert stop.value.code == 0
+        assert f"jaxhand {verb}" in capsys.readouterr().out
+
+
+def test_qualisys_gaps_are_filled(data_root: Path, tmp_path: Path) -> None:
+    """The real recording of the command in the README; every fourth frame keeps it short."""
+    whole = read(data_root / "qualisys" / "recording.tsv")
+    hand = load_hand("qualisys13")
+    part = Recording(whole.names, whole.markers[::4], whole.time[::4], whole.rate / 4, whole.source)
+    tracked = track(part, Model(hand), right=True)
+    seen = part.select(hand.markers).visible
+    assert np.isfinite(tracked.recording.markers).all()
+    assert not seen.all()
+    assert (tracked.status == np.where(seen, Status.OBSERVED, Status.PREDICTED)).all()
+    # A gap is filled near where the marker was when it was seen: within a hand's reach.
+    jump = np.linalg.norm(np.diff(tracked.recording.markers, axis=0), axis=-1)
+    assert jump.max() < 0.2
