@@ -68,8 +68,8 @@ def untransform(rotation: Array, translation: Array, points: Array) -> Array:
 
 def mean_point(points: Array, weight: Array) -> Array:
     """`[..., 3]` weighted mean of `[..., N, 3]` points; the origin where all weights are 0."""
-    total = weight.sum(-1)[..., None]
-    return (points * weight[..., None]).sum(-2) / jnp.where(total > 0, total, 1)
+    total = jnp.maximum(weight.sum(-1)[..., None], 1e-30)
+    return (points * weight[..., None]).sum(-2) / total
 
 
 def second_extent(points: Array, weight: Array) -> Array:

@@ -8,16 +8,16 @@ import numpy as np
 from jaxhand.geometry import apart, product
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, FINGERS, JOINTS, Hand
-from numpy_infer.skeleton import CROSS, JOINT_AXES, SIGNS, SLOTS
+from numpy_infer.skeleton import CROSS, CROSS_SQUARED, JOINT_AXES, SIGNS, SLOTS
 
 
 def rotations_from_angles(angles: Array) -> Array:
     """`[..., 26]` radians, in the order of `hand.ANGLES` → `[..., 15, 3, 3]` parent_from_joint of
     the finger joints (Rodrigues' formula, composed in table order)."""
     signed = (angles * jnp.asarray(SIGNS).astype(angles.dtype))[..., None, None]
-    cross = jnp.asarray(CROSS).astype(angles.dtype)
+    cross, squared = jnp.asarray(CROSS, angles.dtype), jnp.asarray(CROSS_SQUARED, angles.dtype)
     eye = jnp.eye(3, dtype=angles.dtype)
-    single = eye + jnp.sin(signed) * cross + (1 - jnp.cos(signed)) * product(cross, cross)
+    single = eye + jnp.sin(signed) * cross + (1 - jnp.cos(signed)) * squared
     none = jnp.broadcast_to(eye, single[..., :1, :, :].shape)
     single = jnp.concatenate([single, none], -3)
     first, second, third = (apart(single)[..., slot, :, :] for slot in SLOTS)
@@ -66,8 +66,7 @@ def forward_kinematics(
         ],
         -2,
     )
-    turn = jnp.broadcast_to(wrist_rotation[..., None, :, :], (*batch, fingers, 3, 3))
-    place = jnp.broadcast_to(wrist_position[..., None, :], (*batch, fingers, 3))
+    turn, place = wrist_rotation[..., None, :, :], wrist_position[..., None, :]
     turns, places = [], []
     for level in range(3):
         place = place + product(turn, bones[..., level, :, None])[..., 0]

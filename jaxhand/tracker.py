@@ -39,7 +39,9 @@ from numpy_infer.networks import Network
 from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
 from numpy_infer.tracker import (
     DETERMINED_EXTENT,
-    MILLIMETRES_EXTENT,
+    FARTHEST,
+    HUGE,
+    LONGEST,
     SAME_POSTURE,
     SHRINK_SPEED,
 )
@@ -104,18 +106,18 @@ def step(
     Args:
         model: what to run.
         state: from `init` or the previous `step`.
-        markers: `[..., M, 3]` metres, world; a marker with a coordinate that is not finite is
-            hidden.
+        markers: `[..., M, 3]` metres, world; a marker with a coordinate that is not finite, or
+            beyond all measure (`FARTHEST`), is hidden.
         visible: `[..., M]` True where measured; hidden coordinates are never read.
         dt: `[...]` seconds since the previous frame. If it is not positive nothing that runs on
             time moves, and the same markers again change nothing.
     """
     dtype = state.markers.dtype
-    visible = visible & jnp.isfinite(markers).all(-1)
+    visible = visible & (jnp.abs(markers) < FARTHEST).all(-1)
     markers = jnp.where(visible[..., None], markers, 0).astype(dtype)
     markers = jnp.where(state.right[..., None, None], mirror(markers), markers)
     late = ~(dt > 0)
-    elapsed = jnp.where(late, 0, dt).astype(dtype)
+    elapsed = jnp.where(late, 0, jnp.minimum(dt, LONGEST)).astype(dtype)
     repeated = (
         late
         & state.known.any(-1)
@@ -124,7 +126,7 @@ def step(
     )
     new_state = _track(model, state, markers, visible, elapsed)
     new_state = _where(repeated, state, new_state)
-    return new_state, _to_side(new_state, _notice(markers, visible, late))
+    return new_state, _to_side(new_state, _notice(new_state, late))
 
 
 def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State:
@@ -299,7 +301,7 @@ def _blend(
     share = jnp.where(visible & (length > 0), left / jnp.where(length > 0, length, 1), 1)
     correction = correction * share[..., None]
     difference = jnp.where(visible[..., None], registered - anchor, 0)
-    seen = jnp.maximum(visible.sum(-1), 1)
+    seen = jnp.maximum(visible.sum(-1), 1).astype(registered.dtype)
     distance = jnp.sqrt((difference * difference).sum((-1, -2)) / seen)
     fade = jnp.where(tracking, jnp.exp(-distance / model.fade), 0)
     blend = jnp.where(visible[..., None], correction, correction * fade[..., None, None])
@@ -361,39 +363,37 @@ def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> d
     }
 
 
-def _notice(markers: Array, visible: Array, late: Array) -> Array:
-    weight = visible.astype(markers.dtype)
-    centred = (markers - mean_point(markers, weight)[..., None, :]) * weight[..., None]
-    radius = jnp.sqrt((centred * centred).sum((-1, -2)) / jnp.maximum(weight.sum(-1), 1))
-    huge = jnp.where(radius > MILLIMETRES_EXTENT, int(Notice.SUSPECTED_MILLIMETRES), 0)
-    return huge | jnp.where(late, int(Notice.NON_POSITIVE_DT), 0)
+def _notice(state: State, late: Array) -> Array:
+    huge = jnp.abs(state.seen).max((-1, -2)) > HUGE
+    flags = jnp.where(huge, int(Notice.SUSPECTED_MILLIMETRES), 0)
+    return flags | jnp.where(late, int(Notice.NON_POSITIVE_DT), 0)
 
 
 def _to_side(state: State, notice: Array) -> HandPose:
-    """The output as the hand's own side has it, in arrays of the caller's own."""
-    pose = state.pose
-    back = {
-        "markers": mirror,
-        "wrist_rotation": mirror_rotation,
-        "wrist_position": mirror,
-        "rotations": mirror_rotation,
-        "positions": mirror,
-    }
-    fields: dict[str, Any] = {}
-    for name, value in pose._asdict().items():
-        if name in back and value is not None:
-            right = state.right.reshape(state.right.shape + (1,) * (value.ndim - state.right.ndim))
-            fields[name] = jnp.where(right, back[name](value), value)
-        else:
-            fields[name] = value
+    """The output as the hand's own side has it."""
+    fields: dict[str, Any] = state.pose._asdict()
+    for name, reflect in _REFLECTED.items():
+        value: Array = fields[name]
+        if value is not None:
+            fields[name] = jnp.where(_leading(state.right, value), reflect(value), value)
     return HandPose(**fields | {"notice": notice})
+
+
+_REFLECTED = {
+    "markers": mirror,
+    "wrist_rotation": mirror_rotation,
+    "wrist_position": mirror,
+    "rotations": mirror_rotation,
+    "positions": mirror,
+}
 
 
 def _where(condition: Array, yes: Any, no: Any) -> Any:
     """`jnp.where` over equal trees; `condition [...]` is broadcast from the left."""
 
-    def choose(a: Array, b: Array) -> Array:
-        shape = condition.shape + (1,) * (a.ndim - condition.ndim)
-        return jnp.where(condition.reshape(shape), a, b)
+    return jax.tree.map(lambda a, b: jnp.where(_leading(condition, a), a, b), yes, no)
 
-    return jax.tree.map(choose, yes, no)
+
+def _leading(condition: Array, values: Array) -> Array:
+    """`condition [...]` with axes of 1 behind, to go with `values [..., …]`."""
+    return condition.reshape(condition.shape + (1,) * (values.ndim - condition.ndim))

@@ -50,26 +50,19 @@ def untransform(rotation: Array, translation: Array, points: Array) -> Array:
 
 def mean_point(points: Array, weight: Array) -> Array:
     """`[..., 3]` weighted mean of `[..., N, 3]` points; the origin where all weights are 0."""
-    total = weight.sum(-1)[..., None]
-    return (points * weight[..., None]).sum(-2) / np.where(total > 0, total, 1)
+    return (_shares(weight) @ points)[..., 0, :]
+
+
+def _shares(weight: Array) -> Array:
+    """`[..., 1, N]` weights as parts of their sum; 0 where all are 0."""
+    return (weight / np.maximum(weight.sum(-1, keepdims=True), 1e-30))[..., None, :]
 
 
 def second_extent(points: Array, weight: Array) -> Array:
     """`[...]` second singular value of the weighted, centred `[..., N, 3]` points, in metres: 0 for
-    collinear points. The largest eigenvalue of the 3×3 scatter stands in closed form (Smith 1961);
-    the second comes from it, trace and determinant: Smith's is 3 mm for a 20 cm line in float32."""
-    centred = (points - mean_point(points, weight)[..., None, :]) * np.sqrt(weight)[..., None]
-    scatter = np.swapaxes(centred, -1, -2) @ centred
-    mean = (scatter[..., 0, 0] + scatter[..., 1, 1] + scatter[..., 2, 2]) / 3
-    deviation = scatter - mean[..., None, None] * np.eye(3, dtype=scatter.dtype)
-    radius = np.sqrt((deviation * deviation).sum((-1, -2)) / 6)
-    unit = deviation / np.where(radius > 0, radius, 1)[..., None, None]
-    angle = np.arccos(np.clip(determinant(unit) / 2, -1, 1)) / 3
-    largest = mean + 2 * radius * np.cos(angle)
-    half = np.maximum(3 * mean - largest, 0) / 2
-    product_of_two = determinant(scatter) / np.where(largest > 0, largest, 1)
-    gap = half * half - np.clip(product_of_two, 0, half * half)
-    return np.sqrt(half + np.sqrt(gap))
+    collinear points."""
+    centred = (points - _shares(weight) @ points) * np.sqrt(weight)[..., None]
+    return np.linalg.svd(centred, compute_uv=False)[..., 1]
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -102,11 +95,17 @@ def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[A
         `rotation [..., 3, 3]` with determinant +1, `translation [..., 3]`. Without points the
         translation is 0.
     """
-    source_mean, target_mean = mean_point(source, weight), mean_point(target, weight)
-    centred = (target - target_mean[..., None, :]) * weight[..., None]
-    covariance = np.swapaxes(centred, -1, -2) @ (source - source_mean[..., None, :])
-    rotation = nearest_rotation(covariance + prior_weight(covariance)[..., None, None] * prior)
-    return rotation, target_mean - (rotation @ source_mean[..., None])[..., 0]
+    shares = _shares(weight)
+    source_mean, target_mean = shares @ source, shares @ target
+    centred = (target - target_mean) * weight[..., None]
+    covariance = np.swapaxes(centred, -1, -2) @ (source - source_mean)
+    left, extents, right = np.linalg.svd(covariance)
+    # Twice is enough: `prior_weight` measures at least 1/√3 of the second singular value.
+    if (extents[..., 1] < 2 * PRIOR_STRENGTH).any():
+        weighed = covariance + prior_weight(covariance)[..., None, None] * prior
+        left, _, right = np.linalg.svd(weighed)
+    rotation = _proper(left, right)
+    return rotation, (target_mean - source_mean @ np.swapaxes(rotation, -1, -2))[..., 0, :]
 
 
 def prior_weight(covariance: Array) -> Array:
@@ -120,9 +119,17 @@ def prior_weight(covariance: Array) -> Array:
 def nearest_rotation(matrix: Array) -> Array:
     """`[..., 3, 3]` the rotation R that maximises tr(Rᵀ matrix) (Kabsch 1976; Umeyama 1991)."""
     left, _, right = np.linalg.svd(matrix)
-    proper = left @ right
-    flip = np.where(determinant(proper) < 0, 2, 0).astype(matrix.dtype)[..., None, None]
-    return proper - flip * (left[..., :, 2:] @ right[..., 2:, :])
+    return _proper(left, right)
+
+
+def _proper(left: Array, right: Array) -> Array:
+    """`left @ right`, or where that is a reflection, the rotation next to it."""
+    product = left @ right
+    reflected = np.linalg.det(product) < 0
+    if reflected.any():
+        last = 2 * (left[..., :, 2:] @ right[..., 2:, :])
+        product = np.where(reflected[..., None, None], product - last, product)
+    return product
 
 
 def quaternion(rotation: Array) -> Array:

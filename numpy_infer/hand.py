@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -151,7 +152,7 @@ class Hand:
     def __len__(self) -> int:
         return len(self.markers)
 
-    @property
+    @cached_property
     def alignment_weight(self) -> Array:
         """`[M]` 1 for alignment markers, else 0."""
         weight = np.zeros(len(self), np.float32)

@@ -22,6 +22,8 @@ SIGNS = np.array([angle.sign for angle in ANGLES])
 CROSS = np.stack([_cross_matrix(_axis(angle.axis, angle.joint)) for angle in ANGLES])
 """`[26, 3, 3]` cross-product matrices of the angles' axes in the flat hand's frame."""
 
+CROSS_SQUARED = CROSS @ CROSS
+
 _BY_JOINT = [[i for i, a in enumerate(ANGLES) if a.joint == joint] for joint in JOINTS[1:]]
 SLOTS = np.array([[[*of, 26, 26][slot] for of in _BY_JOINT] for slot in range(3)])
 """`[3, 15]` which angle turns each finger joint first, second, third; 26 means none."""
@@ -36,9 +38,10 @@ def rotations_from_angles(angles: Array) -> Array:
     """`[..., 26]` radians, in the order of `hand.ANGLES` → `[..., 15, 3, 3]` parent_from_joint of
     the finger joints (Rodrigues' formula, composed in table order)."""
     signed = (angles * SIGNS.astype(angles.dtype))[..., None, None]
-    cross = CROSS.astype(angles.dtype)
+    cross = CROSS.astype(angles.dtype, copy=False)
+    squared = CROSS_SQUARED.astype(angles.dtype, copy=False)
     eye = np.eye(3, dtype=angles.dtype)
-    single = eye + np.sin(signed) * cross + (1 - np.cos(signed)) * (cross @ cross)
+    single = eye + np.sin(signed) * cross + (1 - np.cos(signed)) * squared
     none = np.broadcast_to(eye, single[..., :1, :, :].shape)
     single = np.concatenate([single, none], -3)
     first, second, third = (single[..., slot, :, :] for slot in SLOTS)
@@ -87,8 +90,7 @@ def forward_kinematics(
         ],
         -2,
     )
-    turn = np.broadcast_to(wrist_rotation[..., None, :, :], (*batch, fingers, 3, 3))
-    place = np.broadcast_to(wrist_position[..., None, :], (*batch, fingers, 3))
+    turn, place = wrist_rotation[..., None, :, :], wrist_position[..., None, :]
     turns, places = [], []
     for level in range(3):
         place = place + (turn @ bones[..., level, :, None])[..., 0]

@@ -46,8 +46,14 @@ DETERMINED_EXTENT = 5e-3
 SAME_POSTURE = 1e-4
 """Metres, RMS: markers that fit this well where they were seen last tell how the hand turned."""
 
-MILLIMETRES_EXTENT = 1.0
-"""Metres: no hand is this big; coordinates that say so are in millimetres."""
+FARTHEST = 1e5
+"""Metres: no coordinate is larger; one that is would overflow where it is squared."""
+
+LONGEST = 3600.0
+"""Seconds: a longer pause counts as this one, so that nothing extrapolated overflows."""
+
+HUGE = 1.0
+"""Metres in the registered frame: no hand is this big; coordinates that say so are millimetres."""
 
 
 def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> State:
@@ -107,18 +113,19 @@ def step(
     Args:
         model: what to run.
         state: from `init` or the previous `step`.
-        markers: `[..., M, 3]` metres, world; a marker with a coordinate that is not finite is
-            hidden.
+        markers: `[..., M, 3]` metres, world; a marker with a coordinate that is not finite, or
+            beyond all measure (`FARTHEST`), is hidden.
         visible: `[..., M]` True where measured; hidden coordinates are never read.
         dt: `[...]` seconds since the previous frame. If it is not positive nothing that runs on
             time moves, and the same markers again change nothing.
     """
     dtype = state.markers.dtype
-    visible = visible & np.isfinite(markers).all(-1)
-    markers = np.where(visible[..., None], markers, 0).astype(dtype)
-    markers = np.where(state.right[..., None, None], mirror(markers), markers)
+    visible = visible & (np.abs(markers) < FARTHEST).all(-1)
+    markers = np.where(visible[..., None], markers, 0).astype(dtype, copy=False)
+    if state.right.any():
+        markers = np.where(state.right[..., None, None], mirror(markers), markers)
     late = ~(dt > 0)
-    elapsed = np.where(late, 0, dt).astype(dtype)
+    elapsed = np.where(late, 0, np.minimum(dt, LONGEST)).astype(dtype)
     repeated = (
         late
         & state.known.any(-1)
@@ -128,13 +135,13 @@ def step(
     new_state = _track(model, state, markers, visible, elapsed)
     if repeated.any():
         new_state = _where(repeated, state, new_state)
-    return new_state, _to_side(new_state, _notice(markers, visible, late))
+    return new_state, _to_side(new_state, _notice(new_state, late))
 
 
 def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State:
     """The state after a frame of clean input of a left hand; its `pose` is the output."""
     weight = visible.astype(markers.dtype)
-    template = model.hand.template.astype(markers.dtype)
+    template = model.hand.template.astype(markers.dtype, copy=False)
     tracking = second_extent(markers, weight) > DETERMINED_EXTENT
     fresh = tracking & ~state.tracked
     both = visible & state.visible
@@ -240,7 +247,7 @@ def _redo(
         seen last.
     """
     dtype = markers.dtype
-    template = model.hand.template.astype(dtype)
+    template = model.hand.template.astype(dtype, copy=False)
     before = transform(state.rotation, state.translation, state.seen)
     before = np.where(state.visible[..., None], state.markers, before)
     turn, move = _motion(state, before, markers, visible, tracking, shift)
@@ -301,7 +308,7 @@ def _blend(
     share = np.where(visible & (length > 0), left / np.where(length > 0, length, 1), 1)
     correction = correction * share[..., None]
     difference = np.where(visible[..., None], registered - anchor, 0)
-    seen = np.maximum(visible.sum(-1), 1)
+    seen = np.maximum(visible.sum(-1), 1).astype(registered.dtype)
     distance = np.sqrt((difference * difference).sum((-1, -2)) / seen)
     fade = np.where(tracking, np.exp(-distance / model.fade), 0)
     blend = np.where(visible[..., None], correction, correction * fade[..., None, None])
@@ -310,8 +317,8 @@ def _blend(
 
 def _pose(model: Model, state: State, output: Array) -> HandPose:
     """The output of a frame, for a left hand, from its markers `[..., M, 3]`."""
-    template = model.hand.template.astype(output.dtype)
-    alignment = np.broadcast_to(model.hand.alignment_weight.astype(output.dtype), output.shape[:-1])
+    template = model.hand.template.astype(output.dtype, copy=False)
+    alignment = model.hand.alignment_weight.astype(output.dtype, copy=False)
     rotation, position = kabsch(template, output, alignment, state.rotation)
     uses_frame = PREDICTORS[model.predictor].uses_frame
     filled = np.where(state.tracking & uses_frame, int(Status.PREDICTED), int(Status.HELD))
@@ -334,6 +341,8 @@ def _pose(model: Model, state: State, output: Array) -> HandPose:
 
 def _expected_error(model: Model, visible: Array, age: Array) -> Array:
     """`[..., M]` metres, from the model's table by number hidden and age."""
+    if visible.all():
+        return np.zeros_like(age)
     table = np.asarray(model.expected_error, age.dtype)
     hidden = (~visible).sum(-1)
     row = table[np.clip(hidden, 1, len(table)) - 1][..., None, :]
@@ -352,7 +361,7 @@ def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> d
     features = features.reshape(*features.shape[:-2], -1)
     angles = predict(network, features, np.ones(features.shape, bool))
     local = rotations_from_angles(angles)
-    skeleton = model.hand.skeleton.astype(markers.dtype)
+    skeleton = model.hand.skeleton.astype(markers.dtype, copy=False)
     positions, rotations = forward_kinematics(skeleton, local, rotation, position)
     return {
         "angles": angles_from_rotations(local).reshape(*angles.shape[:-1], len(ANGLES)),
@@ -361,32 +370,30 @@ def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> d
     }
 
 
-def _notice(markers: Array, visible: Array, late: Array) -> Array:
-    weight = visible.astype(markers.dtype)
-    centred = (markers - mean_point(markers, weight)[..., None, :]) * weight[..., None]
-    radius = np.sqrt((centred * centred).sum((-1, -2)) / np.maximum(weight.sum(-1), 1))
-    huge = np.where(radius > MILLIMETRES_EXTENT, int(Notice.SUSPECTED_MILLIMETRES), 0)
-    return huge | np.where(late, int(Notice.NON_POSITIVE_DT), 0)
+def _notice(state: State, late: Array) -> Array:
+    huge = np.abs(state.seen).max((-1, -2)) > HUGE
+    flags = np.where(huge, int(Notice.SUSPECTED_MILLIMETRES), 0)
+    return flags | np.where(late, int(Notice.NON_POSITIVE_DT), 0)
 
 
 def _to_side(state: State, notice: Array) -> HandPose:
     """The output as the hand's own side has it, in arrays of the caller's own."""
-    pose = state.pose
-    back = {
-        "markers": mirror,
-        "wrist_rotation": mirror_rotation,
-        "wrist_position": mirror,
-        "rotations": mirror_rotation,
-        "positions": mirror,
-    }
-    fields: dict[str, Any] = {}
-    for name, value in pose._asdict().items():
-        if name in back and value is not None:
-            right = state.right.reshape(state.right.shape + (1,) * (value.ndim - state.right.ndim))
-            fields[name] = np.where(right, back[name](value), value)
-        else:
-            fields[name] = None if value is None else value.copy()
+    fields = {k: None if v is None else v.copy() for k, v in state.pose._asdict().items()}
+    if state.right.any():
+        for name, reflect in _REFLECTED.items():
+            value: Array = fields[name]
+            if value is not None:
+                fields[name] = np.where(_leading(state.right, value), reflect(value), value)
     return HandPose(**fields | {"notice": notice})
+
+
+_REFLECTED = {
+    "markers": mirror,
+    "wrist_rotation": mirror_rotation,
+    "wrist_position": mirror,
+    "rotations": mirror_rotation,
+    "positions": mirror,
+}
 
 
 def _where(condition: Array, yes: Any, no: Any) -> Any:
@@ -396,8 +403,12 @@ def _where(condition: Array, yes: Any, no: Any) -> Any:
         return type(yes)(*parts) if parts else yes
     if yes is None:
         return None
-    shape = condition.shape + (1,) * (yes.ndim - condition.ndim)
-    return np.where(condition.reshape(shape), yes, no)
+    return np.where(_leading(condition, yes), yes, no)
+
+
+def _leading(condition: Array, values: Array) -> Array:
+    """`condition [...]` with axes of 1 behind, to go with `values [..., …]`."""
+    return condition.reshape(condition.shape + (1,) * (values.ndim - condition.ndim))
 
 
 class HandTracker:
