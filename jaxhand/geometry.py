@@ -153,13 +153,14 @@ def nearest_rotation(matrix: Array) -> Array:
 
     Not by SVD, which is a LAPACK call for each matrix. Horn's (1987) symmetric 4×4 matrix, whose
     leading eigenvector is the quaternion of R, is shifted to be positive and squared until that
-    eigenvector alone is left; three Newton steps on the rotations then remove float32's error.
+    eigenvector alone is left.
     All of it on scalars side by side, because XLA runs those as one loop over the batch.
     """
     size = jnp.sqrt((matrix * matrix).sum((-1, -2), keepdims=True))
     unit = matrix / jnp.where(size > 0, size, 1)
-    m = tuple(tuple(unit[..., i, j] for j in range(3)) for i in range(3))
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = m
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (
+        [unit[..., i, j] for j in range(3)] for i in range(3)
+    )
     # |unit| = 1, so the eigenvalues lie within ±√3 and a shift of 1.75 makes all of them positive.
     horn = (
         *(xx - yy - zz + 1.75, xy + yx, xz + zx, zy - yz),
@@ -172,8 +173,7 @@ def nearest_rotation(matrix: Array) -> Array:
     # Every column of the projector is the eigenvector; take the longest.
     pivot = jnp.argmax(jnp.stack([xx, yy, zz, ww], -1), -1)
     q = tuple(jnp.select([pivot == i for i in range(4)], list(column)) for column in columns)
-    q = jax.lax.fori_loop(0, 3, lambda _, q: _newton(m, q), _normalised(q))
-    return jnp.stack([jnp.stack(row, -1) for row in _rotation(q)], -2)
+    return jnp.stack([jnp.stack(row, -1) for row in _rotation(_normalised(q))], -2)
 
 
 def _squared(_: int, upper: tuple[Array, ...]) -> tuple[Array, ...]:
@@ -202,37 +202,6 @@ def _rotation(q: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:
         (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
         (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-
-
-def _newton(matrix: tuple[tuple[Array, ...], ...], q: tuple[Array, ...]) -> tuple[Array, ...]:
-    """One Newton step for max tr(Rᵀ matrix) from the unit quaternion `q`."""
-    rotation = _rotation(q)
-    m = [[sum(rotation[k][i] * matrix[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
-    gradient = (m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1])
-    # Minus the Hessian, tr(S) I − S with S the symmetric part of m, solved by its cofactors.
-    a, b, c = m[1][1] + m[2][2], m[0][0] + m[2][2], m[0][0] + m[1][1]
-    d, e, f = -(m[0][1] + m[1][0]) / 2, -(m[0][2] + m[2][0]) / 2, -(m[1][2] + m[2][1]) / 2
-    cofactors = (
-        (b * c - f * f, e * f - c * d, d * f - b * e),
-        (e * f - c * d, a * c - e * e, d * e - a * f),
-        (d * f - b * e, d * e - a * f, a * b - d * d),
-    )
-    det = a * cofactors[0][0] + d * cofactors[0][1] + e * cofactors[0][2]
-    # A rotation that the matrix leaves open has no Newton step.
-    scale = jnp.where(det > 1e-14, 0.5 / jnp.where(det > 1e-14, det, 1), 0)
-    i, j, k = (
-        jnp.clip(scale * sum(entry * g for entry, g in zip(row, gradient, strict=True)), -0.1, 0.1)
-        for row in cofactors
-    )
-    x, y, z, w = q
-    return _normalised(
-        (
-            x + w * i + y * k - z * j,
-            y + w * j + z * i - x * k,
-            z + w * k + x * j - y * i,
-            w - x * i - y * j - z * k,
-        )
     )
 
 

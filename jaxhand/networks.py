@@ -34,7 +34,7 @@ class Layers(nnx.Module):
 
     def __init__(self, spec: Spec, inputs: int, *, rngs: nnx.Rngs) -> None:
         self.spec = spec
-        self.layers = nnx.List()
+        self.layers: nnx.List = nnx.List()
         for layer in spec:
             if isinstance(layer, Dense):
                 linear = nnx.Linear(

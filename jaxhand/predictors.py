@@ -154,8 +154,11 @@ def affine_combination(frame: Array, weight: Array, markers: Array) -> tuple[Arr
     now, now_mean = centre(markers[..., None, :, :], weight)
     then = then * weight[..., None]
     scatter = apart(inner(then, then))
-    ridge = (RIDGE * jnp.eye(3)).astype(markers.dtype)
-    coefficients = apart(solve(scatter + ridge, own - then_mean))
+    # λ must not drown in the rounding of a scatter that is no hand's, or there is no solution.
+    trace = scatter[..., 0, 0] + scatter[..., 1, 1] + scatter[..., 2, 2]
+    ridge = jnp.maximum(trace * (2 * jnp.finfo(markers.dtype).eps), RIDGE)[..., None, None]
+    eye = jnp.eye(3, dtype=markers.dtype)
+    coefficients = apart(solve(scatter + ridge * eye, own - then_mean))
     shares = apart(product(then, coefficients[..., None]))
     return now_mean + inner(now, shares)[..., 0], weight.any(-1)
 

@@ -66,7 +66,9 @@ def forward_kinematics(
         ],
         -2,
     )
-    turn, place = wrist_rotation[..., None, :, :], wrist_position[..., None, :]
+    wrist = jnp.broadcast_to(wrist_position[..., None, :], (*batch, 1, 3))
+    wrist_turn = jnp.broadcast_to(wrist_rotation[..., None, :, :], (*batch, 1, 3, 3))
+    turn, place = wrist_turn, wrist
     turns, places = [], []
     for level in range(3):
         place = place + product(turn, bones[..., level, :, None])[..., 0]
@@ -75,8 +77,6 @@ def forward_kinematics(
         places.append(place)
     tips = place + product(turn, bones[..., 3, :, None])[..., 0]
     joints = jnp.stack(places, -2).reshape(*batch, 15, 3)
-    wrist = jnp.broadcast_to(wrist_position[..., None, :], (*batch, 1, 3))
-    wrist_turn = jnp.broadcast_to(wrist_rotation[..., None, :, :], (*batch, 1, 3, 3))
     finger_turns = jnp.stack(turns, -3).reshape(*batch, 15, 3, 3)
     return (
         jnp.concatenate([wrist, joints, tips], -2),

@@ -25,6 +25,7 @@ from jaxhand.geometry import (
     mean_point,
     mirror,
     mirror_rotation,
+    product,
     second_extent,
     transform,
     untransform,
@@ -247,7 +248,9 @@ def _redo(
     returned = untransform(turn, move, markers)
     returned = jnp.where(state.visible[..., None], state.markers, returned)
     previous: Array = apart(jnp.where(visible[..., None], returned, 0))
-    found = kabsch(template, previous, visible.astype(dtype), rotation)
+    # The prior is that of now, carried back too: if only the set has changed, so has nothing else.
+    prior = product(jnp.swapaxes(turn, -1, -2), state.rotation)
+    found = kabsch(template, previous, visible.astype(dtype), prior)
     then_rotation = jnp.where(tracking[..., None, None], found[0], state.rotation)
     then_translation = jnp.where(tracking[..., None], found[1], state.translation)
     then = (then_rotation, then_translation)

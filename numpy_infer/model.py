@@ -7,8 +7,10 @@ import io
 import json
 import os
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,9 @@ FORMAT, VERSION = "jaxhand-model", 1
 
 SIZE_LIMIT = 64 << 20
 """Bytes: more than this, unpacked, is no model of ours and is not read."""
+
+HEADER_LIMIT = 4 << 20
+"""Bytes: more than this is no header of ours."""
 
 ERROR_AGES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0)
 """Seconds hidden at which `Model.expected_error` stands; between them it is linear."""
@@ -75,7 +80,8 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
     """Writes a model file. It appears whole or not at all.
 
     Raises:
-        ValueError: the file exists and `overwrite` is False.
+        ValueError: the file exists and `overwrite` is False; or the model holds what could not be
+            read back.
     """
     path = Path(path)
     if path.exists() and not overwrite:
@@ -94,12 +100,18 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
         "predictor": model.predictor,
         "joints": model.joints,
         "networks": networks,
-        "fade": model.fade,
-        "continuity": model.continuity,
+        "fade": float(model.fade),
+        "continuity": bool(model.continuity),
         "training": dict(model.training),
     }
+    try:  # as it will be read: keys are strings, tuples are lists
+        header = json.loads(json.dumps(header, allow_nan=False))
+    except TypeError as error:
+        raise ValueError(f"'training' must be plain data: {error}") from None
+    _check_header(header)
+    _check_expected_error(arrays["expected_error"])
     header["checksum"] = _checksum(header, arrays)
-    text = json.dumps(header, indent=1, allow_nan=False).encode()
+    text = json.dumps(header, indent=1).encode()
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, header=np.frombuffer(text, np.uint8), **arrays)
     part = path.with_name(path.name + ".part")
@@ -119,21 +131,31 @@ def load(path: str | Path) -> Model:
             return _read(archive)
     except FileNotFoundError:
         raise ValueError(f"no model file {path}") from None
-    except (zipfile.BadZipFile, EOFError, KeyError, NotImplementedError, OSError) as error:
-        raise ValueError(f"{path}: not a model file, or a damaged one: {error}") from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from None
+    except _DAMAGE as error:
+        raise ValueError(f"{path}: not a model file, or a damaged one: {error}") from None
+
+
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, OSError, RuntimeError)
+"""What `zipfile` raises for damaged archives. A RuntimeError is one that says it is encrypted, or
+packed in a way that there is none of."""
+
+
+_PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 def _read(archive: zipfile.ZipFile) -> Model:
     sizes = {info.filename: info.file_size for info in archive.infolist()}
     if len(sizes) != len(archive.infolist()):
         raise ValueError("a part stands twice")
+    if any(info.compress_type not in _PACKED for info in archive.infolist()):
+        raise ValueError("not a model file, or a damaged one: packed in another way than zip's own")
     if sum(sizes.values()) > SIZE_LIMIT:
         raise ValueError(f"unpacks to more than {SIZE_LIMIT >> 20} MB, which no model does")
     if "header.npy" not in sizes:
         raise ValueError("not a model file: it has no header")
-    header = json.loads(bytes(_array(archive, "header.npy")).decode())
+    header = json.loads(_array(archive, "header", (None,), HEADER_LIMIT, "|u1").tobytes().decode())
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError("not a model file: its header says nothing of " + FORMAT)
     if header.get("version") != VERSION:
@@ -144,6 +166,9 @@ def _read(archive: zipfile.ZipFile) -> Model:
     expected |= {"continuity", "training", "checksum"}
     if set(header) != expected or not isinstance(header["networks"], dict):
         raise ValueError(f"damaged header: expected {sorted(expected)}, found {sorted(header)}")
+    for name in sorted(set(header["networks"]) - {"marker_network", "joint_network"}):
+        raise ValueError(f"damaged header: unknown network {name!r}")
+    _check_header(header)
     hand = hand_from_json(header["hand"])
     shapes: dict[str, tuple[int, ...]] = {}
     specs = {name: read_spec(layers) for name, layers in header["networks"].items()}
@@ -157,10 +182,10 @@ def _read(archive: zipfile.ZipFile) -> Model:
     names = {f"{name}.npy" for name in (*shapes, "expected_error", "header")}
     for part in sorted(names ^ set(sizes)):
         raise ValueError(f"array {part[:-4]!r} is {'missing' if part in names else 'unexpected'}")
-    arrays = {name: _array(archive, f"{name}.npy") for name in ("expected_error", *shapes)}
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape:
-            raise ValueError(f"array {name!r}: expected shape {shape}, found {arrays[name].shape}")
+    arrays = {name: _array(archive, name, shape) for name, shape in shapes.items()}
+    table = _array(archive, "expected_error", (None, len(ERROR_AGES)), HEADER_LIMIT)
+    arrays["expected_error"] = table
+    _check_expected_error(table)
     checksum = header.pop("checksum")
     if _checksum(header, arrays) != checksum:
         raise ValueError("the checksum does not fit: the file is damaged")
@@ -168,7 +193,6 @@ def _read(archive: zipfile.ZipFile) -> Model:
         name: Network(spec, **_gather(arrays, name, array_shapes(spec, 3 * len(hand))))
         for name, spec in specs.items()
     }
-    _check_header(header)
     return Model(
         hand=hand,
         predictor=header["predictor"],
@@ -190,9 +214,47 @@ def _check_header(header: Mapping[str, Any]) -> None:
         raise ValueError(f"header: 'fade' must be positive metres, found {header['fade']}")
 
 
-def _array(archive: zipfile.ZipFile, name: str) -> Array:
-    with archive.open(name) as member:
-        return np.lib.format.read_array(member, allow_pickle=False)
+def _check_expected_error(table: Array) -> None:
+    fits = table.ndim == 2 and len(table) and table.shape[1] == len(ERROR_AGES)
+    if not fits or not np.isfinite(table).all():
+        raise ValueError(
+            f"array 'expected_error': expected finite [K, {len(ERROR_AGES)}], found {table.shape}"
+        )
+
+
+def _array(
+    archive: zipfile.ZipFile,
+    name: str,
+    shape: tuple[int | None, ...],
+    limit: int | None = None,
+    *dtypes: str,
+) -> Array:
+    """One part of the file. What it says of itself is held against what is expected before memory
+    is spent on it; a None in `shape` stands for any length, within `limit` bytes."""
+    info = archive.getinfo(f"{name}.npy")
+    if limit is None:
+        limit = 8 * prod(n or 1 for n in shape) + 1024
+    if info.file_size > limit:
+        raise ValueError(f"array {name!r}: {info.file_size} bytes, expected at most {limit}")
+    stream = io.BytesIO(archive.read(info))
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        raise ValueError(f"array {name!r}: expected npy version (1, 0), found {version}")
+    found, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    fits = len(found) == len(shape) and all(
+        n is None or m == n for m, n in zip(found, shape, strict=True)
+    )
+    if not fits:
+        raise ValueError(f"array {name!r}: expected shape {shape}, found {found}")
+    if dtype.str not in (dtypes or _FLOATS):
+        raise ValueError(f"array {name!r}: expected {dtypes or _FLOATS}, found {dtype}")
+    if prod(found) * dtype.itemsize != info.file_size - stream.tell():
+        raise ValueError(f"array {name!r}: its shape {found} does not fit its size")
+    stream.seek(0)
+    return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+_FLOATS = ("<f4", "<f8")
 
 
 def _gather(

@@ -114,7 +114,7 @@ def predict(network: Network, inputs: Array, known: Array) -> Array:
 
 def _read_layer(i: int, data: Any) -> Layer:
     where = f"layer {i}"
-    if not isinstance(data, Mapping) or data.get("type") not in LAYERS:
+    if not isinstance(data, Mapping) or data.get("type") not in list(LAYERS):
         raise ValueError(f"{where}: expected a layer of type {', '.join(LAYERS)}, found {data!r}")
     kind = LAYERS[data["type"]]
     entries = {key: value for key, value in data.items() if key != "type"}

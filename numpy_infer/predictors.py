@@ -195,8 +195,11 @@ def affine_combination(frame: Array, weight: Array, markers: Array) -> tuple[Arr
     now, now_mean = centre(markers[..., None, :, :], weight)
     then = then * weight[..., None]
     scatter = np.swapaxes(then, -1, -2) @ then
-    ridge = (RIDGE * np.eye(3)).astype(markers.dtype)
-    coefficients = solve(scatter + ridge, own - then_mean)
+    # λ must not drown in the rounding of a scatter that is no hand's, or there is no solution.
+    trace = scatter[..., 0, 0] + scatter[..., 1, 1] + scatter[..., 2, 2]
+    ridge = np.maximum(trace * (2 * np.finfo(markers.dtype).eps), RIDGE)[..., None, None]
+    eye = np.eye(3, dtype=markers.dtype)
+    coefficients = solve(scatter + ridge * eye, own - then_mean)
     change = np.swapaxes(now, -1, -2) @ (then @ coefficients[..., None])
     return now_mean + change[..., 0], weight.any(-1)
 

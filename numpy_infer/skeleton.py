@@ -90,7 +90,9 @@ def forward_kinematics(
         ],
         -2,
     )
-    turn, place = wrist_rotation[..., None, :, :], wrist_position[..., None, :]
+    wrist = np.broadcast_to(wrist_position[..., None, :], (*batch, 1, 3))
+    wrist_turn = np.broadcast_to(wrist_rotation[..., None, :, :], (*batch, 1, 3, 3))
+    turn, place = wrist_turn, wrist
     turns, places = [], []
     for level in range(3):
         place = place + (turn @ bones[..., level, :, None])[..., 0]
@@ -99,8 +101,6 @@ def forward_kinematics(
         places.append(place)
     tips = place + (turn @ bones[..., 3, :, None])[..., 0]
     joints = np.stack(places, -2).reshape(*batch, 15, 3)
-    wrist = np.broadcast_to(wrist_position[..., None, :], (*batch, 1, 3))
-    wrist_turn = np.broadcast_to(wrist_rotation[..., None, :, :], (*batch, 1, 3, 3))
     finger_turns = np.stack(turns, -3).reshape(*batch, 15, 3, 3)
     return (
         np.concatenate([wrist, joints, tips], -2),

@@ -254,7 +254,9 @@ def _redo(
     returned = untransform(turn, move, markers)
     returned = np.where(state.visible[..., None], state.markers, returned)
     previous: Array = np.where(visible[..., None], returned, 0)
-    found = kabsch(template, previous, visible.astype(dtype), rotation)
+    # The prior is that of now, carried back too: if only the set has changed, so has nothing else.
+    prior = np.swapaxes(turn, -1, -2) @ state.rotation
+    found = kabsch(template, previous, visible.astype(dtype), prior)
     then_rotation = np.where(tracking[..., None, None], found[0], state.rotation)
     then_translation = np.where(tracking[..., None], found[1], state.translation)
     then = (then_rotation, then_translation)

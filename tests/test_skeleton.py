@@ -198,6 +198,9 @@ def test_leading_axes_are_free(
     markers = side.skeleton.marker_positions(HAND, positions, turns)
     back = side.skeleton.angles_from_rotations(rotations)
     assert markers.shape == (2, 1, len(HAND), 3)
+    shared = side.skeleton.forward_kinematics(HAND.skeleton, rotations, *motion)  # one wrist
+    for one, other in zip(shared, (positions, turns), strict=True):
+        assert_allclose(one, other, rtol=0, atol=side.metres)
     for i, one in enumerate(angles):
         alone = side.skeleton.rotations_from_angles(one)
         placed = side.skeleton.forward_kinematics(HAND.skeleton, alone, *motion)
