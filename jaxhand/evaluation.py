@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -25,6 +26,7 @@ from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.hand import CHAINS
 from numpy_infer.model import Model
+from numpy_infer.pose import HandPose
 
 COUNTS = (1, 2, 3, 4)
 """Markers hidden at once."""
@@ -43,7 +45,7 @@ BLOCK_SECONDS = 4.0
 RESAMPLINGS, FEWEST_BLOCKS = 1000, 10
 
 CHUNK = 4096
-"""Trials run at once: a compromise of memory and speed, and one shape to compile for."""
+"""The most trials run at once. All chunks have one size, to compile once."""
 
 MEASURED_POINTS = np.array([point for chain in CHAINS for point in chain[1:]])
 """`[15]` PIP, DIP and tip of the fingers; MCP, IP and tip of the thumb."""
@@ -101,7 +103,7 @@ def table3(
     """
     starts = find_starts(sequences)
     return {
-        name: _table_of(model, starts, seeds, lambda share, name=name: report(name, share))
+        name: _table_of(model, starts, seeds, partial(report, name))
         for name, model in models.items()
     }
 
@@ -179,7 +181,7 @@ def joint_errors(model: Model, dataset: data.Dataset) -> dict[str, dict[str, Cel
     if model.joint_network is None:
         raise ValueError("the model has no joint network")
     frames = data.complete_frames(dataset)
-    if frames.angles is None:
+    if frames.angles is None or frames.positions is None or frames.rotations is None:
         raise ValueError(f"data set {dataset.name!r} has no joint truth")
     observed = dataset.observed_angles
     observed = np.ones(frames.angles.shape[-1], bool) if observed is None else observed
@@ -216,11 +218,11 @@ def _table_of(
     blocks = int(starts.block.max()) + 1
     total = np.zeros((len(COUNTS), len(DURATIONS), blocks))
     number = np.zeros(total.shape, int)
-    chunks = range(0, len(starts.start), CHUNK)
+    chunks, size = _chunks(len(starts.start))
     for done, first in enumerate(chunks):
         report(done / len(chunks))
-        part = Starts(starts.frames, *(array[first : first + CHUNK] for array in starts[1:]))
-        state = _visible_until(model, part)
+        part = Starts(starts.frames, *(array[first : first + size] for array in starts[1:]))
+        state = _visible_until(model, part, size)
         for i, count in enumerate(COUNTS):
             for j, duration in enumerate(DURATIONS):
                 for seed in range(seeds):
@@ -238,13 +240,19 @@ def _table_of(
     }
 
 
-def _visible_until(model: Model, starts: Starts) -> Any:
-    """The tracker's state at each start, after 20 visible frames."""
-    state = tracker.init(model, (CHUNK,))
-    visible = jnp.ones((CHUNK, len(model.hand)), bool)
+def _chunks(count: int) -> tuple[range, int]:
+    """Where the chunks of `count` trials begin, and their size."""
+    size = -(-count // -(-count // CHUNK))
+    return range(0, count, size), size
+
+
+def _visible_until(model: Model, starts: Starts, size: int) -> Any:
+    """The tracker's state `[size]` at each start, after 20 visible frames."""
+    state = tracker.init(model, (size,))
+    visible = jnp.ones((size, len(model.hand)), bool)
     for back in range(VISIBLE_BEFORE - 1, -1, -1):
-        markers = starts.frames[_padded(starts.start) - back]
-        state, _ = _step(model, state, markers, visible, jnp.full(CHUNK, 1 / data.RATE))
+        markers = starts.frames[_padded(starts.start, size) - back]
+        state, _ = _step(model, state, markers, visible, jnp.full(size, 1 / data.RATE))
     return state
 
 
@@ -256,17 +264,18 @@ def _errors(
     hidden = hide(rng, len(starts.start), len(model.hand), count)
     admissible = starts.room >= frames
     last = starts.start + np.where(admissible, frames, 0)
-    truth = starts.frames[_padded(last)]
-    visible = ~_padded(hidden)
-    _, output = _step(model, state, truth, visible, jnp.full(CHUNK, duration))
+    size = len(state.tracked)
+    truth = starts.frames[_padded(last, size)]
+    visible = ~_padded(hidden, size)
+    _, output = _step(model, state, truth, visible, jnp.full(size, duration))
     distance = np.linalg.norm(np.asarray(output) - truth, axis=-1)[: len(hidden)]
     error = 1e2 * (distance * hidden).sum(-1) / count
     return error[admissible], starts.block[admissible]
 
 
-def _padded(values: Array) -> Array:
-    """`[n, ...]` → `[CHUNK, ...]`, the last one repeated."""
-    return values[np.minimum(np.arange(CHUNK), len(values) - 1)]
+def _padded(values: Array, size: int) -> Array:
+    """`[n, ...]` → `[size, ...]`, the last one repeated."""
+    return values[np.minimum(np.arange(size), len(values) - 1)]
 
 
 @jax.jit
@@ -277,21 +286,22 @@ def _step(model: Model, state: Any, markers: Array, visible: Array, dt: Array) -
     return state, pose.markers
 
 
-@jax.jit
-def _first_pose(model: Model, markers: Array) -> Any:
-    batch = markers.shape[:-2]
-    visible = jnp.ones(markers.shape[:-1], bool)
-    return tracker.step(model, tracker.init(model, batch), markers, visible, jnp.zeros(batch))[1]
-
-
 def _poses(model: Model, markers: Array) -> Any:
     """The tracker's output on complete frames `[N, M, 3]`, each as a first frame."""
+    chunks, size = _chunks(len(markers))
+    state = tracker.init(model, (size,))
+    visible, dt = jnp.ones((size, len(model.hand)), bool), jnp.zeros(size)
     parts = []
-    for first in range(0, len(markers), CHUNK):
-        part = markers[first : first + CHUNK]
-        pose = _first_pose(model, jnp.asarray(_padded(part), jnp.float32))
-        parts.append(jax.tree.map(lambda a, n=len(part): np.asarray(a)[:n], pose))
-    return jax.tree.map(lambda *arrays: np.concatenate(arrays), *parts)
+    for first in chunks:
+        part = markers[first : first + size]
+        pose = _pose(model, state, jnp.asarray(_padded(part, size), jnp.float32), visible, dt)
+        parts.append([np.asarray(array)[: len(part)] for array in pose])
+    return HandPose(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+@jax.jit
+def _pose(model: Model, state: Any, markers: Array, visible: Array, dt: Array) -> HandPose:
+    return tracker.step(model, state, markers, visible, dt)[1]
 
 
 @jax.jit
@@ -302,14 +312,14 @@ def _positions(model: Model, angles: Array, rotation: Array, position: Array) ->
 
 
 def _frame_blocks(dataset: data.Dataset, frames: data.CompleteFrames) -> Array:
+    """`[N]` bootstrap block of each complete frame."""
     takes: dict[tuple[str, int], int] = {}
     blocks = []
-    for i, sequence in enumerate(dataset.sequences):
-        length = sequence.rate * BLOCK_SECONDS
-        number = np.arange((frames.sequence == i).sum())
-        keys = [(sequence.take, int(n / length)) for n in number]
-        blocks.append(np.array([takes.setdefault(key, len(takes)) for key in keys], int))
-    return np.concatenate(blocks)
+    for number, index in zip(frames.sequence, frames.index, strict=True):
+        sequence = dataset.sequences[number]
+        key = (sequence.take, int(index / (sequence.rate * BLOCK_SECONDS)))
+        blocks.append(takes.setdefault(key, len(takes)))
+    return np.array(blocks)
 
 
 def _interval_of(values: Array, blocks: Array) -> Cell:

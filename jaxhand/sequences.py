@@ -53,10 +53,11 @@ class Dataset:
 
 class CompleteFrames(NamedTuple):
     """Frames of a data set in which every marker is seen and, where it has joint truth, that is
-    known. sequence: `[N]` index of each frame's sequence. The others as in `Sequence`, with N
-    frames; the last three are None without joint truth."""
+    known. sequence: `[N]` index of each frame's sequence. index: `[N]` its place there. The others
+    as in `Sequence`, with N frames; the last three are None without joint truth."""
 
     sequence: Array
+    index: Array
     markers: Array
     positions: Array | None = None
     rotations: Array | None = None
@@ -75,8 +76,8 @@ def complete_frames(dataset: Dataset) -> CompleteFrames:
         )
         for field in fields
     }
-    index = np.repeat(np.arange(len(keep)), [k.sum() for k in keep])
-    return CompleteFrames(sequence=index, **arrays)
+    sequence = np.repeat(np.arange(len(keep)), [k.sum() for k in keep])
+    return CompleteFrames(sequence, np.concatenate([*map(np.flatnonzero, keep)]), **arrays)
 
 
 def _all_finite(arrays: list[Array]) -> Array:

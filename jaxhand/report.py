@@ -1,0 +1,152 @@
+"""`jaxhand evaluate`: measures a model, prints the tables, writes JSON and a picture."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from jaxhand.datasets import Dataset, load
+from jaxhand.evaluation import COUNTS, DURATIONS, SEEDS, joint_errors, mean_ratio, methods, table3
+from jaxhand.options import DataSets, Takes
+from numpy_infer.model import Model
+from numpy_infer.model import load as load_model
+from numpy_infer.predictors import PREDICTORS
+
+BASELINES = tuple(name for name in PREDICTORS if name not in ("learned", "none"))
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """What to measure, on what, and where to write it; the command line of `jaxhand evaluate`."""
+
+    data: DataSets
+    """Data set NAME[:PATH]; its test split is taken. One a table."""
+    model: str | None = None
+    """A model file of `jaxhand train`, or the name of a baseline for the baselines alone."""
+    test: Takes = ()
+    """Takes to test on instead of the data set's default split."""
+    json: Path | None = None
+    """Write all figures here."""
+    plot: Path | None = None
+    """Draw Table 3 here, like the paper's Fig. 15(a); needs the extra `plot`."""
+    seeds: int = SEEDS
+    """How many times every start is taken, with other markers hidden."""
+    overwrite: bool = False
+    """Replace files that exist."""
+
+
+def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[str, Any]:
+    """Measures, prints, writes.
+
+    Returns:
+        What `--json` holds: `{"table3": {METHOD: {"1".."4": {"0.1".."2.0": CELL}}},
+        "joints": {METHOD: {"cm", "deg", "wrist_mm", "wrist_deg": CELL}}}`, see `evaluation`.
+
+    Raises:
+        ValueError: no model named, a file that is none or that exists already, no data.
+    """
+    console = console or Console()
+    if config.seeds < 1:
+        raise ValueError(f"seeds: expected 1 or more, found {config.seeds}")
+    for path in (config.json, config.plot):
+        if path is not None and path.exists() and not config.overwrite:
+            raise ValueError(f"{path} exists: choose another name, or pass --overwrite")
+    if config.model is None:
+        raise ValueError(
+            "no weights are bundled yet: name a model with --model FILE (jaxhand train makes one), "
+            f"or a baseline: {', '.join(BASELINES)}"
+        )
+    if len(config.data) != 1:
+        raise ValueError(f"expected one --data, found {len(config.data)}: each gets its own table")
+    model = None if config.model in BASELINES else load_model(config.model)
+    hand = model.hand if model else None
+    dataset = load(config.data[0], "test", hand=hand, takes=config.test or None)
+    for note in dataset.notes:
+        console.print(f"[dim]{note}[/dim]")
+    model = model or Model(dataset.hand, predictor=str(config.model))
+    result: dict[str, Any] = {
+        "table3": _table3(model, dataset, config.seeds, console),
+        "joints": {},
+    }
+    print_table3(result["table3"], console)
+    if model.joint_network is not None and dataset.sequences[0].angles is not None:
+        result["joints"] = joint_errors(model, dataset)
+        print_joints(result["joints"], console)
+    if config.json is not None:
+        config.json.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
+        console.print(f"wrote {config.json}")
+    if config.plot is not None:
+        from jaxhand.pictures import table3_picture
+
+        table3_picture(result, config.plot, overwrite=config.overwrite)
+        console.print(f"wrote {config.plot}")
+    return result
+
+
+def print_table3(table: Mapping[str, Any], console: Console) -> None:
+    """Table 3 as the paper prints it: error in cm, with half of its 95 % interval."""
+    title = "Error of k hidden markers, cm (paper, Table 3)"
+    # Narrow enough for a terminal of 80 columns.
+    printed = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    for heading in ("method", "k", *(f"{duration:g} s" for duration in DURATIONS)):
+        justify: Any = "left" if heading == "method" else "right"
+        printed.add_column(heading, justify=justify, no_wrap=True)
+    for name, rows in table.items():
+        for count in COUNTS:
+            cells = [_cell(rows[str(count)][f"{duration:.1f}"]) for duration in DURATIONS]
+            last = count == COUNTS[-1]
+            printed.add_row(name if count == 1 else "", str(count), *cells, end_section=last)
+    console.print(printed)
+    if "learned" in table:
+        ratio = mean_ratio(table, "learned", "affine")
+        console.print(f"learned / affine, mean of the cells: {ratio:.3f}")
+
+
+def print_joints(joints: Mapping[str, Any], console: Console) -> None:
+    """The joint stage with nothing hidden."""
+    printed = Table(title="Joints with nothing hidden: PIP, DIP and tip; thumb MCP, IP and tip")
+    columns = {
+        "cm": "position (cm)",
+        "deg": "angles (°)",
+        "wrist_mm": "wrist (mm)",
+        "wrist_deg": "wrist (°)",
+    }
+    printed.add_column("method")
+    for heading in columns.values():
+        printed.add_column(heading, justify="right")
+    for name, cells in joints.items():
+        printed.add_row(name, *(_cell(cells[key]) for key in columns))
+    console.print(printed)
+
+
+def _table3(
+    model: Model, dataset: Dataset, seeds: int, console: Console
+) -> dict[str, dict[str, dict[str, Any]]]:
+    rows = methods(replace(model, joints="none"))
+    columns = (TextColumn("{task.description:18}"), BarColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console) as progress:
+        bars = {name: progress.add_task(name, total=1.0, start=False) for name in rows}
+
+        def report(name: str, share: float) -> None:
+            progress.start_task(bars[name])
+            progress.update(bars[name], completed=share)
+
+        return table3(rows, dataset.sequences, seeds=seeds, report=report)
+
+
+def _cell(cell: Mapping[str, Any]) -> str:
+    if cell["mean"] is None:
+        return "–"
+    digits = 2 if cell["mean"] < 9.995 else 1
+    mean = f"{cell['mean']:.{digits}f}"
+    if cell["low"] is None:
+        return mean
+    return f"{mean} [dim]±{(cell['high'] - cell['low']) / 2:.{digits}f}[/dim]"

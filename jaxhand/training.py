@@ -1,0 +1,451 @@
+"""Trains the networks (paper, section 3.4); what they learn stands in `tasks`.
+
+Keys are folded in from seed and epoch, so a training that goes on from a checkpoint gives the same
+numbers, bit for bit, as one that was never interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from datetime import timedelta
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import tyro
+from rich.console import Console
+
+from jaxhand import runs
+from jaxhand.datasets import Split, load
+from jaxhand.export import export, finish
+from jaxhand.networks import from_arrays
+from jaxhand.options import DataSets, Takes
+from jaxhand.sequences import Dataset, complete_frames
+from jaxhand.tasks import Frames, Task, joint_task, marker_task
+from numpy_infer.arrays import Array
+from numpy_infer.hand import ANGLES, Hand, load_hand
+from numpy_infer.model import Model
+from numpy_infer.networks import Dense, Dropout, Spec, read_spec, write_spec
+
+ADAM = optax.scale_by_adam()
+
+SAVE_SECONDS = 5.0
+"""A checkpoint is written when the last one is older: a machine that goes down takes no more."""
+
+Report = Callable[["Metrics"], None]
+
+
+def read_layers(text: str) -> Spec:
+    """Hidden layers from `200,0.1,150`: a whole number is that many ReLU units, a part of 1 a
+    dropout; or from a JSON file with a list of layers as `numpy_infer.networks.read_spec` has it.
+
+    Raises:
+        ValueError: neither; the message names the layer.
+    """
+    if text.endswith(".json"):
+        layers = json.loads(Path(text).read_text("utf-8"))
+    else:
+        layers = [_read_layer(part) for part in text.split(",")]
+    return read_spec([*layers, {"type": "dense", "units": 1, "activation": "linear"}])[:-1]
+
+
+def _read_layer(text: str) -> dict[str, Any]:
+    try:
+        number = float(text)
+    except ValueError:
+        raise ValueError(
+            f"layer {text!r}: expected units such as 200, a dropout such as 0.1, or a .json file"
+        ) from None
+    if 0 < number < 1:
+        return {"type": "dropout", "rate": number}
+    return {"type": "dense", "units": int(number) if number.is_integer() else number}
+
+
+def _write_layers(spec: Spec) -> list[str]:
+    return [",".join(str(x.units if isinstance(x, Dense) else x.rate) for x in spec)]
+
+
+Layers = Annotated[
+    Spec,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="LAYERS",
+        instance_from_str=lambda arguments: read_layers(arguments[0]),
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=_write_layers,
+    ),
+]
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """Everything a training depends on, and the command line of `jaxhand train`."""
+
+    data: DataSets
+    """Data set NAME[:PATH][@WEIGHT], as often as wanted; a frame of weight 2 is drawn twice as
+    often."""
+    out: Path
+    """Folder of the run: config.json, metrics.jsonl, checkpoints, model.npz."""
+    hand: str | None = None
+    """Name or file of the hand; by default what the first data set is read as."""
+    train: Takes = ()
+    """Takes (SIG18: users) to train on instead of the data set's default split."""
+    validation: Takes = ()
+    """Takes (SIG18: users) to validate on instead of the data set's default split."""
+    marker_layers: Layers = (Dense(200), Dense(150), Dense(200))
+    """Hidden layers of the marker network: units with ReLU, dropouts as parts of 1 (200,0.1,200),
+    or a JSON file; a linear layer follows."""
+    joint_layers: Layers = (Dense(200), Dropout(0.1), Dense(200), Dropout(0.1), Dense(200))
+    """Hidden layers of the joint network, likewise."""
+    joints: bool = True
+    """Train the joint network too, where the data have joint truth."""
+    occlusions: tuple[float, ...] = (0.70, 0.17, 0.08, 0.05)
+    """Probabilities that 1, 2, 3, … markers are hidden."""
+    batch: int = 32
+    """Frames a step."""
+    learning_rate: float = 1e-3
+    """Adam's, at the start."""
+    halve_after: int = 5
+    """Epochs without progress of the validation loss after which the learning rate is halved."""
+    stop_after: int = 11
+    """Epochs without progress after which the training ends."""
+    epochs: int = 300
+    """The most epochs for each network."""
+    seed: int = 0
+    """The same seed gives the same numbers on the same machine."""
+    resume: bool = False
+    """Go on from the checkpoint in the run's folder."""
+    overwrite: bool = False
+    """Throw away the run that the folder holds."""
+
+    def __post_init__(self) -> None:
+        for name in ("batch", "halve_after", "stop_after", "epochs"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected 1 or more, found {getattr(self, name)}")
+        if not 0 < self.learning_rate < math.inf:
+            raise ValueError(f"learning_rate: expected above 0, found {self.learning_rate}")
+        if min(self.occlusions, default=-1) < 0 or abs(sum(self.occlusions) - 1) > 1e-6:
+            raise ValueError(f"occlusions: expected parts that sum to 1, found {self.occlusions}")
+        if self.resume and self.overwrite:
+            raise ValueError("resume and overwrite exclude each other")
+        if (self.train or self.validation) and len(self.data) != 1:
+            raise ValueError("takes can be named for one data set only")
+
+
+class Metrics(NamedTuple):
+    """What is reported of an epoch."""
+
+    network: str
+    epoch: int
+    loss: float
+    """Mean squared error in scaled units, training frames."""
+    validation_loss: float
+    """The same, validation frames."""
+    validation_cm: float
+    """Mean distance: of hidden markers, or of the joints `JOINT_POINTS` to forward kinematics of
+    the true angles."""
+    learning_rate: float
+    frames_per_second: float
+    seconds: float
+    """Duration of the epoch with its validation."""
+
+
+class Plateau(NamedTuple):
+    """The learning rate, and how long the validation loss has stood still."""
+
+    learning_rate: float
+    best: float = math.inf
+    """The least validation loss so far."""
+    stale: int = 0
+    """Epochs since."""
+
+    def after(self, loss: float, config: TrainingConfig) -> Plateau:
+        """The state after an epoch with this validation loss."""
+        if loss < self.best:
+            return Plateau(self.learning_rate, loss)
+        stale = self.stale + 1
+        rate = self.learning_rate / 2 if stale % config.halve_after == 0 else self.learning_rate
+        return Plateau(rate, self.best, stale)
+
+
+class Fit(NamedTuple):
+    """What is carried from epoch to epoch: all that a checkpoint holds."""
+
+    epoch: int
+    weights: dict[str, Array]
+    moments: Any
+    """Adam's."""
+    best: dict[str, Array]
+    """The weights at the least validation loss."""
+    plateau: Plateau
+
+    def finished(self, config: TrainingConfig) -> bool:
+        return self.epoch >= config.epochs or self.plateau.stale >= config.stop_after
+
+
+def epoch_function(
+    spec: Spec, batch: int, prepare: Callable[[Array, Any], tuple[Array, Array]]
+) -> Callable[..., tuple[dict[str, Array], Any, Array]]:
+    """One epoch, all of it on the device.
+
+    `epoch(weights, moments, learning_rate, key, frames, weight) -> (weights, moments, loss)`:
+    frames are drawn, prepared in one go (see `Task.prepare`; no gradient goes through it), and a
+    scan over the batches takes a step of Adam for each. The last, partial batch is left out.
+    """
+
+    def epoch(
+        weights: dict[str, Array],
+        moments: Any,
+        learning_rate: float,
+        key: Array,
+        frames: Any,
+        weight: Array | None,
+    ) -> tuple[dict[str, Array], Any, Array]:
+        draw_key, prepare_key, dropout_key = jax.random.split(key, 3)
+        drawn = _draw(draw_key, frames, weight, batch)
+        inputs, targets = prepare(prepare_key, drawn)
+        rate = jnp.float32(learning_rate)
+        return _scan(spec, batch, weights, moments, rate, dropout_key, inputs, targets)
+
+    return epoch
+
+
+@partial(jax.jit, static_argnames="batch")
+def _draw(key: Array, frames: Any, weight: Array | None, batch: int) -> Any:
+    """As many frames as there are, in whole batches: each once, or by weight."""
+    count = len(jax.tree.leaves(frames)[0])
+    order = jax.random.choice(key, count, (count,), replace=weight is not None, p=weight)
+    return jax.tree.map(lambda array: array[order[: count - count % batch]], frames)
+
+
+@partial(jax.jit, static_argnames=("spec", "batch"))
+def _scan(
+    spec: Spec,
+    batch: int,
+    weights: dict[str, Array],
+    moments: Any,
+    learning_rate: Array,
+    key: Array,
+    inputs: Array,
+    targets: Array,
+) -> tuple[dict[str, Array], Any, Array]:
+    def mean_loss(weights: dict[str, Array], inputs: Array, targets: Array, key: Array) -> Array:
+        return ((from_arrays(spec, weights)(inputs, key) - targets) ** 2).mean()
+
+    def step(carry: Any, data: Any) -> tuple[Any, Array]:
+        weights, moments = carry
+        number, inputs, targets = data
+        step_key = jax.random.fold_in(key, number)
+        loss, slope = jax.value_and_grad(mean_loss)(weights, inputs, targets, step_key)
+        with jax.numpy_dtype_promotion("standard"):  # optax takes a float to the power of an int
+            direction, moments = ADAM.update(slope, moments)
+        weights = jax.tree.map(lambda w, d: w - learning_rate * d, weights, direction)
+        return (weights, moments), loss
+
+    steps = len(inputs) // batch
+    split = [array.reshape(steps, batch, -1) for array in (inputs, targets)]
+    carry, losses = jax.lax.scan(step, (weights, moments), (jnp.arange(steps), *split))
+    return *carry, losses.mean()
+
+
+def fit_networks(
+    training: Frames,
+    validation: Frames,
+    hand: Hand,
+    config: TrainingConfig,
+    report: Report = lambda _: None,
+    folder: Path | None = None,
+) -> Model:
+    """Trains on arrays, without any data set on disk.
+
+    Ctrl-C ends the training and keeps the best weights; `Model.training["interrupted"]` says so.
+
+    Args:
+        training, validation: complete frames; both with angles where a joint network is wanted.
+        hand: markers are registered to its template, and angles move its skeleton.
+        config: of which `data`, `out`, `hand` and the takes are not read.
+        report: called after every epoch.
+        folder: where metrics and checkpoints are kept and, if there are any, gone on from; None
+            keeps nothing.
+
+    Raises:
+        ValueError: misshapen or too few frames, or no loss was finite.
+        KeyboardInterrupt: before the end of the first epoch, when there is nothing to keep.
+    """
+    if not config.joints:
+        training, validation = (x._replace(angles=None) for x in (training, validation))
+    _check_frames("training", training, hand, config.batch)
+    _check_frames("validation", validation, hand, 1)
+    tasks = [partial(marker_task, hidden=config.marker_layers, occlusions=config.occlusions)]
+    if training.angles is not None and validation.angles is not None:
+        tasks.append(partial(joint_task, hidden=config.joint_layers))
+    networks: dict[str, Any] = {}
+    summary: dict[str, Any] = {"frames": len(training.markers), "interrupted": False}
+    for number, make in enumerate(tasks):
+        key = jax.random.fold_in(jax.random.key(config.seed), number)
+        task = make(training, validation, hand, key=key)
+        fit, summary["interrupted"] = _fit(task, config, key, report, folder)
+        if math.isfinite(fit.plateau.best):
+            networks[task.name] = jax.tree.map(np.asarray, replace(task.network, arrays=fit.best))
+            error = float(task.measure(fit.best)[1]) * 100
+            summary[task.name] = {"epochs": fit.epoch, "validation_cm": error}
+        elif not summary["interrupted"]:
+            raise ValueError(f"{task.name}: the loss is not finite; lower the learning rate")
+        if summary["interrupted"]:
+            break
+    if not networks:
+        raise KeyboardInterrupt
+    joints = "learned" if "joint_network" in networks else "none"
+    return Model(hand, predictor="learned", joints=joints, training=summary, **networks)
+
+
+def _check_frames(what: str, frames: Frames, hand: Hand, least: int) -> None:
+    shape = np.shape(frames.markers)
+    if len(shape) != 3 or shape[1:] != (len(hand), 3):
+        raise ValueError(f"{what}: expected markers [N, {len(hand)}, 3], found {list(shape)}")
+    if not np.isfinite(frames.markers).all():
+        raise ValueError(f"{what}: markers must all be measured, found some that are not finite")
+    known = shape[0] if frames.angles is None else np.isfinite(frames.angles).all(-1).sum()
+    if known < least:
+        raise ValueError(f"{what}: expected {least} or more complete frames, found {known}")
+
+
+def _fit(
+    task: Task, config: TrainingConfig, key: Array, report: Report, folder: Path | None
+) -> tuple[Fit, bool]:
+    """Trains one network; True if it was interrupted."""
+    run = epoch_function(task.network.spec, config.batch, task.prepare)
+    weights = dict(task.network.arrays)
+    fit = Fit(0, weights, ADAM.init(weights), weights, Plateau(config.learning_rate))
+    with runs.checkpoints(folder, task.name) as checkpoints:
+        fit = Fit(**runs.restore(checkpoints, fit._asdict()))
+        runs.forget(folder, task.name, fit.epoch)
+        saved = time.monotonic()
+        try:
+            while not fit.finished(config):
+                advanced, metrics = _advance(run, task, fit, config, key)
+                runs.record(folder, metrics._asdict())
+                fit = advanced
+                report(metrics)
+                if time.monotonic() - saved > SAVE_SECONDS:
+                    runs.save(checkpoints, fit.epoch, fit._asdict())
+                    saved = time.monotonic()
+        except KeyboardInterrupt:
+            interrupted = True
+        else:
+            interrupted = False
+        runs.save(checkpoints, fit.epoch, fit._asdict())
+    return fit, interrupted
+
+
+def _advance(
+    run: Callable[..., Any], task: Task, fit: Fit, config: TrainingConfig, key: Array
+) -> tuple[Fit, Metrics]:
+    """One epoch and its validation."""
+    number, rate = fit.epoch + 1, fit.plateau.learning_rate
+    began = time.perf_counter()
+    epoch_key = jax.random.fold_in(key, number)
+    weights, moments, loss = run(
+        fit.weights, fit.moments, rate, epoch_key, task.frames, task.weight
+    )
+    loss = float(loss)  # waits for the epoch
+    trained = time.perf_counter()
+    validation_loss, error = map(float, task.measure(weights))
+    plateau = fit.plateau.after(validation_loss, config)
+    best = weights if plateau.best < fit.plateau.best else fit.best
+    metrics = Metrics(
+        network=task.name,
+        epoch=number,
+        loss=loss,
+        validation_loss=validation_loss,
+        validation_cm=error * 100,
+        learning_rate=rate,
+        frames_per_second=len(jax.tree.leaves(task.frames)[0]) / (trained - began),
+        seconds=time.perf_counter() - began,
+    )
+    return Fit(number, weights, moments, best, plateau), metrics
+
+
+def train(config: TrainingConfig) -> Model:
+    """Trains on data sets, chooses what is chosen on validation, and writes `model.npz`.
+
+    Raises:
+        ValueError: data that are missing or do not fit together, or a folder that is in use.
+    """
+    if not config.data:
+        raise ValueError("name a data set to train on: --data NAME:PATH")
+    console = Console(soft_wrap=True, highlight=False)
+    runs.check(config.out, _plain(config))
+    training, validation = _load(config, "train"), _load(config, "validation")
+    hand = mean_hand(training)
+    runs.create(config.out, _plain(config))
+
+    def report(m: Metrics) -> None:
+        left = timedelta(seconds=round((config.epochs - m.epoch) * m.seconds))
+        console.print(
+            f"{m.network} {m.epoch}/{config.epochs}  loss {m.loss:.4f}  "
+            f"validation {m.validation_loss:.4f}, {m.validation_cm:.3f} cm  "
+            f"rate {m.learning_rate:.1e}  {m.frames_per_second:,.0f} frames/s  at most {left} left"
+        )
+
+    model = fit_networks(gather(training), gather(validation), hand, config, report, config.out)
+    if model.training["interrupted"]:
+        console.print("interrupted: the best weights so far are kept; --resume goes on")
+    model = replace(model, training={**model.training, "config": _plain(config)})
+    model = finish(model, [s for d in validation for s in d.sequences], console.print)
+    model = export(model, config.out / "model.npz", overwrite=True)
+    console.print(f"wrote {config.out / 'model.npz'}")
+    return model
+
+
+def mean_hand(datasets: list[Dataset]) -> Hand:
+    """The hand of the data, with the mean of the skeletons that are known, each frame alike."""
+    known = [d for d in datasets if d.observed_angles is not None]
+    if not known:
+        return datasets[0].hand
+    frames = [sum(len(s.markers) for s in d.sequences) for d in known]
+    skeleton = np.average([d.hand.skeleton for d in known], axis=0, weights=frames)
+    return known[0].hand.with_skeleton(skeleton)
+
+
+def _load(config: TrainingConfig, split: Split) -> list[Dataset]:
+    hand = None if config.hand is None else load_hand(config.hand)
+    takes = config.train if split == "train" else config.validation
+    datasets = [load(spec, split, hand=hand, takes=takes or None) for spec in config.data]
+    for dataset in datasets[1:]:
+        if dataset.hand.markers != datasets[0].hand.markers:
+            raise ValueError(
+                f"{dataset.name} has markers {', '.join(dataset.hand.markers)}; {datasets[0].name} "
+                f"has {', '.join(datasets[0].hand.markers)}: pass one --hand for both"
+            )
+    return datasets
+
+
+def gather(datasets: list[Dataset]) -> Frames:
+    """The complete frames of all data sets, with their weights."""
+    parts = [complete_frames(dataset) for dataset in datasets]
+    angles = None
+    if any(p.angles is not None for p in parts):
+        unknown = [np.full((len(p.markers), len(ANGLES)), np.nan, np.float32) for p in parts]
+        angles = np.concatenate(
+            [u if p.angles is None else p.angles for p, u in zip(parts, unknown, strict=True)]
+        )
+    weight = None
+    if len({dataset.weight for dataset in datasets}) > 1:
+        weight = np.repeat([d.weight for d in datasets], [len(p.markers) for p in parts])
+    return Frames(np.concatenate([p.markers for p in parts]), angles, weight)
+
+
+def _plain(config: TrainingConfig) -> dict[str, Any]:
+    """The config as JSON has it."""
+    plain = {field.name: getattr(config, field.name) for field in fields(config)}
+    layers = {name: write_spec(plain[name]) for name in ("marker_layers", "joint_layers")}
+    return json.loads(json.dumps(plain | layers, default=str))

@@ -1,0 +1,410 @@
+"""Laws of training: masks, targets, the plateau, the same numbers again, and what a run leaves."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+jax = pytest.importorskip("jax")
+pytest.importorskip("tyro")
+
+from strategies import HIGH, LOW, turn  # noqa: E402
+
+from jaxhand import cli, runs, tasks, training  # noqa: E402
+from jaxhand.networks import predict  # noqa: E402
+from jaxhand.sequences import Dataset, Sequence  # noqa: E402
+from jaxhand.skeleton import (  # noqa: E402
+    forward_kinematics,
+    marker_positions,
+    rotations_from_angles,
+)
+from jaxhand.tasks import Frames  # noqa: E402
+from jaxhand.training import Plateau, TrainingConfig, fit_networks  # noqa: E402
+from numpy_infer import model as model_file  # noqa: E402
+from numpy_infer.geometry import kabsch, untransform  # noqa: E402
+from numpy_infer.hand import load_hand  # noqa: E402
+from numpy_infer.networks import Dense, Dropout  # noqa: E402
+
+HAND = load_hand("glove9")
+CONFIG = TrainingConfig(
+    data=(),
+    out=Path("nowhere"),
+    marker_layers=(Dense(24),),
+    joint_layers=(Dense(24), Dropout(0.1), Dense(16)),
+    epochs=4,
+)
+OCCLUSIONS = np.array(CONFIG.occlusions, np.float32)
+
+
+def make_frames(count: int, seed: int) -> Frames:
+    """Hands that open and close by one number each, somewhere in the world."""
+    rng = np.random.default_rng(seed)
+    share = rng.uniform(0, 0.6, (count, 5))[:, [0] * 6 + [1] * 5 + [2] * 5 + [3] * 5 + [4] * 5]
+    angles = (share * HIGH + 0.02 * rng.standard_normal((count, 26))).clip(LOW, HIGH)
+    angles = angles.astype(np.float32)
+    pose = np.broadcast_to(turn((1, 2, 3), 1.0).astype(np.float32), (count, 3, 3))
+    place = rng.uniform(-1, 1, (count, 3)).astype(np.float32)
+    skeleton = HAND.skeleton.astype(np.float32)
+    points = forward_kinematics(skeleton, rotations_from_angles(angles), pose, place)
+    return Frames(np.asarray(marker_positions(HAND, *points)), angles)
+
+
+TRAINING, VALIDATION = make_frames(320, 0), make_frames(320, 1)
+
+
+def fit(config: TrainingConfig = CONFIG, **options: Any) -> tuple[Any, list[training.Metrics]]:
+    metrics: list[training.Metrics] = []
+    options = {"report": metrics.append, **options}
+    return fit_networks(TRAINING, VALIDATION, HAND, config, **options), metrics
+
+
+def assert_same_networks(a: Any, b: Any) -> None:
+    for name in ("marker_network", "joint_network"):
+        jax.tree.map(np.testing.assert_array_equal, getattr(a, name), getattr(b, name))
+
+
+@pytest.fixture(scope="module")
+def fitted() -> tuple[Any, list[training.Metrics]]:
+    return fit()
+
+
+def without_clock(metrics: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in metrics.items() if k not in ("seconds", "frames_per_second")}
+
+
+# --- what is learned
+
+
+def visible_of(occlusions: tuple[float, ...], count: int = 20000, markers: int = 9) -> Any:
+    probabilities = np.array(occlusions, np.float32)
+    return np.asarray(tasks.draw_visible(jax.random.key(3), probabilities, (count, markers)))
+
+
+def test_as_many_markers_are_hidden_as_asked() -> None:
+    hidden = (~visible_of(CONFIG.occlusions)).sum(-1)
+    share = np.bincount(hidden, minlength=5)[1:] / len(hidden)
+    np.testing.assert_allclose(share, CONFIG.occlusions, atol=0.015)
+
+
+def test_every_marker_is_hidden_alike() -> None:
+    hidden = ~visible_of((0, 0, 1.0, 0))
+    assert (hidden.sum(-1) == 3).all()
+    np.testing.assert_allclose(hidden.mean(0), 3 / 9, atol=0.015)
+
+
+def test_three_markers_are_always_left() -> None:
+    assert visible_of((0, 0, 0, 1.0), markers=5).sum(-1).min() == 3
+
+
+@pytest.fixture(scope="module")
+def marker_task() -> tasks.Task:
+    key = jax.random.key(0)
+    return tasks.marker_task(
+        TRAINING, VALIDATION, HAND, key, CONFIG.marker_layers, CONFIG.occlusions
+    )
+
+
+def masks_of(key: Any) -> Any:
+    shape = TRAINING.markers.shape[:-1]
+    return np.asarray(tasks.draw_visible(key, OCCLUSIONS, shape))
+
+
+def test_hidden_inputs_are_zero(marker_task: tasks.Task) -> None:
+    key = jax.random.key(5)
+    inputs, targets = map(np.asarray, marker_task.prepare(key, TRAINING.markers))
+    known = np.repeat(masks_of(key), 3, -1)
+    assert (inputs[~known] == 0).all()
+    np.testing.assert_array_equal(inputs[known], targets[known])
+    assert (targets[~known] != 0).mean() > 0.99
+
+
+def test_hidden_markers_change_no_input_and_no_other_target(marker_task: tasks.Task) -> None:
+    key = jax.random.key(5)
+    visible = masks_of(key)
+    noise = np.random.default_rng(0).normal(size=TRAINING.markers.shape).astype(np.float32)
+    moved = np.where(visible[..., None], TRAINING.markers, noise)
+    before = marker_task.prepare(key, TRAINING.markers)
+    after = marker_task.prepare(key, moved)
+    np.testing.assert_array_equal(before[0], after[0])
+    known = np.repeat(visible, 3, -1)
+    np.testing.assert_array_equal(np.where(known, before[1], 0), np.where(known, after[1], 0))
+
+
+def test_training_prepares_as_the_runtime_does(marker_task: tasks.Task) -> None:
+    key, network = jax.random.key(5), marker_task.network
+    visible, markers = masks_of(key), TRAINING.markers
+    eye = np.broadcast_to(np.eye(3, dtype=np.float32), (len(markers), 3, 3))
+    measured = np.where(visible[..., None], markers, 0)
+    template = HAND.template.astype(np.float32)
+    motion = kabsch(template, measured, visible.astype(np.float32), eye)
+    registered = untransform(*motion, measured).reshape(len(markers), -1)
+    inputs, _ = marker_task.prepare(key, markers)
+    known = np.repeat(visible, 3, -1)
+    scaled = (registered - network.input_mean) / network.input_scale
+    np.testing.assert_allclose(inputs, np.where(known, scaled, 0), atol=2e-4)
+
+
+def test_validation_is_measured_in_the_units_of_the_data(marker_task: tasks.Task) -> None:
+    network, template = marker_task.network, HAND.template.astype(np.float32)
+    loss, metres = marker_task.measure(network.arrays)
+    key = jax.random.key(0)
+    visible, truth = tasks.occlude(key, VALIDATION.markers, template, OCCLUSIONS)
+    flat = np.asarray(truth).reshape(len(truth), -1)
+    predicted = predict(network, flat, np.repeat(np.asarray(visible), 3, -1))
+    off = np.asarray(predicted).reshape(truth.shape) - np.asarray(truth)
+    distance = np.linalg.norm(off, axis=-1)[~np.asarray(visible)]
+    np.testing.assert_allclose(metres, distance.mean(), rtol=1e-4)
+    np.testing.assert_allclose(loss, np.mean((off / network.output_scale[0]) ** 2), rtol=1e-4)
+
+
+def test_frames_of_more_weight_are_drawn_more_often() -> None:
+    drawn = []
+
+    def remember(key: Any, frames: Any) -> Any:
+        jax.debug.callback(drawn.append, frames)
+        return frames[:, None], frames[:, None]
+
+    spec = (Dense(1, "linear"),)
+    weights = {"0.kernel": np.zeros((1, 1), np.float32), "0.bias": np.zeros(1, np.float32)}
+    frames = np.arange(4000, dtype=np.float32)
+    weight = np.where(frames < 2000, 3, 1).astype(np.float32)
+    epoch = training.epoch_function(spec, 32, remember)
+    rate, moments = np.float32(0.1), training.ADAM.init(weights)
+    for share, given in ((0.75, weight), (0.5, None)):
+        epoch(weights, moments, rate, jax.random.key(0), frames, given)[2].block_until_ready()
+        jax.effects_barrier()
+        assert abs(np.mean(drawn[-1] < 2000) - share) < 0.03
+    assert len(np.unique(drawn[-1])) == 4000
+
+
+# --- how it is learned
+
+
+def test_plateau_halves_after_five_and_stops_after_eleven() -> None:
+    state = training.Fit(1, {}, None, {}, Plateau(1e-3).after(1.0, CONFIG))
+    config = replace(CONFIG, epochs=300)
+    rates = []
+    while not state.finished(config):
+        state = state._replace(plateau=state.plateau.after(1.0, config))
+        rates.append(state.plateau.learning_rate)
+    assert rates == [1e-3] * 4 + [5e-4] * 5 + [2.5e-4] * 2
+
+
+def test_progress_starts_the_count_anew_but_not_the_rate() -> None:
+    plateau = Plateau(1e-3)
+    for loss in (1.0, *[2.0] * 7, 0.5):
+        plateau = plateau.after(loss, CONFIG)
+    assert plateau == Plateau(5e-4, 0.5, 0)
+    assert plateau.after(float("nan"), CONFIG) == Plateau(5e-4, 0.5, 1)
+
+
+def test_loss_goes_down(fitted: Any) -> None:
+    model, metrics = fitted
+    for name in ("marker_network", "joint_network"):
+        own = [m for m in metrics if m.network == name]
+        assert [m.epoch for m in own] == [1, 2, 3, 4]
+        assert own[-1].loss < 0.9 * own[0].loss
+        assert own[-1].validation_cm < own[0].validation_cm
+        best = min(own, key=lambda m: m.validation_loss)
+        assert model.training[name]["validation_cm"] == pytest.approx(best.validation_cm)
+
+
+def test_the_model_can_be_saved(fitted: Any, tmp_path: Path) -> None:
+    model_file.save(fitted[0], tmp_path / "model.npz")
+    assert_same_networks(model_file.load(tmp_path / "model.npz"), fitted[0])
+
+
+def test_same_seed_same_numbers(fitted: Any) -> None:
+    model, metrics = fit()
+    assert_same_networks(model, fitted[0])
+    assert [without_clock(m._asdict()) for m in metrics] == [
+        without_clock(m._asdict()) for m in fitted[1]
+    ]
+    other, _ = fit(replace(CONFIG, seed=1, joints=False, epochs=1))
+    mean = "0.kernel"
+    assert (other.marker_network.arrays[mean] != model.marker_network.arrays[mean]).any()
+
+
+@pytest.mark.parametrize("interrupted", ["marker_network", "joint_network"])
+def test_resuming_equals_not_stopping(fitted: Any, interrupted: str, tmp_path: Path) -> None:
+    def report(metrics: training.Metrics) -> None:
+        if (metrics.network, metrics.epoch) == (interrupted, 2):
+            raise KeyboardInterrupt
+
+    broken, _ = fit(report=report, folder=tmp_path)
+    assert broken.training["interrupted"]
+    # What a machine leaves that went down after its last checkpoint.
+    with (tmp_path / "metrics.jsonl").open("a") as file:
+        file.write(json.dumps({"network": interrupted, "epoch": 3}) + '\n{"network": "mar')
+    model, _ = fit(folder=tmp_path)
+    assert_same_networks(model, fitted[0])
+    lines = [json.loads(line) for line in (tmp_path / "metrics.jsonl").read_text().splitlines()]
+    assert [without_clock(line) for line in lines] == [
+        without_clock(m._asdict()) for m in fitted[1]
+    ]
+
+
+def test_ctrl_c_keeps_the_best_weights(fitted: Any) -> None:
+    def report(metrics: training.Metrics) -> None:
+        if metrics.epoch == 2:
+            raise KeyboardInterrupt
+
+    model, _ = fit(report=report)
+    two, _ = fit(replace(CONFIG, epochs=2, joints=False))
+    assert model.training["interrupted"]
+    assert not two.training["interrupted"]
+    assert model.joints == "none"
+    assert_same_networks(model, two)
+
+
+def test_without_joint_truth_there_is_no_joint_network() -> None:
+    bare = Frames(TRAINING.markers)
+    model = fit_networks(bare, bare, HAND, replace(CONFIG, epochs=1))
+    assert model.joint_network is None
+    assert model.joints == "none"
+
+
+# --- from data sets to a file
+
+
+def make_dataset(name: str, frames: Frames, weight: float, stretch: float | None) -> Dataset:
+    """Sequences of 20 frames, too short to be evaluated; with joint truth if `stretch` says how
+    long the bones are."""
+    parts, unused = range(0, len(frames.markers), 20), np.zeros((20, 1, 3))
+    sequences = tuple(
+        Sequence(
+            f"{name}{i}/left",
+            f"{name}{i}",
+            60.0,
+            frames.markers[i : i + 20],
+            *(() if stretch is None else (unused, unused, frames.angles[i : i + 20])),
+        )
+        for i in parts
+    )
+    hand = HAND.with_skeleton(HAND.skeleton * (stretch or 1))
+    return Dataset(name, hand, sequences, weight, None if stretch is None else np.ones(26, bool))
+
+
+def test_a_run_leaves_a_model_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    halves = [Frames(TRAINING.markers[i : i + 160], TRAINING.angles[i : i + 160]) for i in (0, 160)]
+    datasets = {
+        "a": make_dataset("a", halves[0], 2.0, 1.1),
+        "b": make_dataset("b", halves[1], 1.0, None),
+    }
+    monkeypatch.setattr(training, "load", lambda spec, split, **_: datasets[spec])
+    config = replace(CONFIG, data=("a", "b"), out=tmp_path / "run", epochs=1, joints=False)
+    model = training.train(config)
+    assert_same_networks(model_file.load(tmp_path / "run" / "model.npz"), model)
+    assert model.training["frames"] == 320
+    assert model.training["config"]["marker_layers"][0]["units"] == 24
+    with pytest.raises(ValueError, match="not empty"):
+        training.train(config)
+    more = training.train(replace(config, epochs=2, resume=True))
+    once = training.train(replace(config, epochs=2, out=tmp_path / "once"))
+    assert_same_networks(more, once)
+    assert more.training["marker_network"]["epochs"] == 2
+
+
+def test_data_sets_are_joined_frame_by_frame() -> None:
+    known = make_dataset("a", Frames(TRAINING.markers[:40], TRAINING.angles[:40]), 2.0, 1.1)
+    bare = make_dataset("b", Frames(VALIDATION.markers[:20]), 1.0, None)
+    frames = training.gather([known, bare])
+    np.testing.assert_array_equal(frames.markers[:40], TRAINING.markers[:40])
+    np.testing.assert_array_equal(frames.angles[:40], TRAINING.angles[:40])
+    assert np.isnan(frames.angles[40:]).all()
+    np.testing.assert_array_equal(frames.weight, [2.0] * 40 + [1.0] * 20)
+    assert training.gather([bare, bare])[1:] == (None, None)
+    # Bones are those of the data set that knows them.
+    hand = training.mean_hand([bare, known])
+    np.testing.assert_allclose(hand.skeleton, HAND.skeleton * 1.1)
+
+
+def test_hands_are_averaged_over_frames() -> None:
+    few, many = Frames(TRAINING.markers[:80], TRAINING.angles[:80]), TRAINING
+    hand = training.mean_hand(
+        [make_dataset("few", few, 1.0, 1.5), make_dataset("many", many, 1.0, 1.0)]
+    )
+    np.testing.assert_allclose(hand.skeleton, HAND.skeleton * 1.1)
+    assert training.mean_hand([make_dataset("bare", few, 1.0, None)]).name == HAND.name
+
+
+def test_data_sets_of_different_markers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    other = replace(make_dataset("b", VALIDATION, 1.0, None), hand=load_hand("dense19"))
+    datasets = {"a": make_dataset("a", TRAINING, 1.0, None), "b": other}
+    monkeypatch.setattr(training, "load", lambda spec, split, **_: datasets[spec])
+    with pytest.raises(ValueError, match=r"b has markers .* pass one --hand"):
+        training.train(replace(CONFIG, data=("a", "b")))
+
+
+# --- what is refused
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"batch": 0}, "batch"),
+        ({"learning_rate": -1.0}, "learning_rate"),
+        ({"occlusions": (0.5, 0.4)}, "occlusions"),
+        ({"resume": True, "overwrite": True}, "exclude"),
+        ({"data": ("a", "b"), "train": ("x",)}, "one data set"),
+    ],
+)
+def test_senseless_configs_are_refused(wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(CONFIG, **wrong)
+
+
+def test_senseless_frames_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"expected markers \[N, 9, 3\], found \[320, 8, 3\]"):
+        fit_networks(Frames(TRAINING.markers[:, :8]), VALIDATION, HAND, CONFIG)
+    with pytest.raises(ValueError, match="expected 32 or more complete frames, found 31"):
+        fit_networks(Frames(TRAINING.markers[:31]), VALIDATION, HAND, CONFIG)
+    holes = np.where(np.arange(320)[:, None, None] == 7, np.nan, TRAINING.markers)
+    with pytest.raises(ValueError, match="not finite"):
+        fit_networks(Frames(holes), VALIDATION, HAND, CONFIG)
+
+
+def test_layers_are_read_from_text_and_file(tmp_path: Path) -> None:
+    assert training.read_layers("200,0.1,150") == (Dense(200), Dropout(0.1), Dense(150))
+    file = tmp_path / "layers.json"
+    file.write_text('[{"type": "dense", "units": 8, "activation": "linear"}]')
+    assert training.read_layers(str(file)) == (Dense(8, "linear"),)
+    for wrong in ("200,x", "0", "1.5", "", "-3"):
+        with pytest.raises(ValueError, match="layer"):
+            training.read_layers(wrong)
+
+
+def plain(**options: Any) -> dict[str, Any]:
+    return {"seed": 0, "epochs": 3, "resume": False, "overwrite": False, **options}
+
+
+def test_a_used_folder_is_refused_unless_told_what_to_do(tmp_path: Path) -> None:
+    runs.check(tmp_path / "new", plain())
+    runs.create(tmp_path / "new", plain())
+    with pytest.raises(ValueError, match=r"--resume .* --overwrite"):
+        runs.check(tmp_path / "new", plain())
+    runs.check(tmp_path / "new", plain(resume=True, epochs=9))
+    with pytest.raises(ValueError, match="trained with seed 0, not 1"):
+        runs.check(tmp_path / "new", plain(resume=True, seed=1))
+    with pytest.raises(ValueError, match="no run to resume"):
+        runs.check(tmp_path, plain(resume=True))
+
+
+def test_overwriting_removes_a_runs_own_files_only(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    (tmp_path / "metrics.jsonl").write_text("{}\n")
+    (tmp_path / "checkpoints" / "marker_network").mkdir(parents=True)
+    runs.create(tmp_path, plain(overwrite=True))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.json", "thesis.tex"]
+
+
+def test_the_command_line_says_what_is_wrong_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert cli.train(["--data", "nonsense", "--out", str(tmp_path)]) == 2
+    assert "jaxhand train: no data set 'nonsense'" in capsys.readouterr().err
