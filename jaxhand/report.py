@@ -95,7 +95,7 @@ def print_table3(table: Mapping[str, Any], console: Console) -> None:
     """Table 3 as the paper prints it: error in cm, with half of its 95 % interval."""
     title = "Error of k hidden markers, cm (paper, Table 3)"
     # Narrow enough for a terminal of 80 columns.
-    printed = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0), show_edge=False)
+    printed = Table(title=title, box=SIMPLE_HEAD, padding=0, show_edge=False)
     for heading in ("method", "k", *(f"{duration:g} s" for duration in DURATIONS)):
         justify: Any = "left" if heading == "method" else "right"
         printed.add_column(heading, justify=justify, no_wrap=True)

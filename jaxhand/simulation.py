@@ -241,8 +241,15 @@ def frames(key: Array, hand: Hand, count: int) -> tuple[Array, Array]:
     before, after = poses(pose_key, (2, count))
     angles = before + minimum_jerk(jax.random.uniform(time_key, (count, 1))) * (after - before)
     skeleton = bone_lengths(bone_key, hand, (count,))
-    still = (jnp.broadcast_to(jnp.eye(3), (count, 3, 3)), jnp.zeros((count, 3)))
-    return markers(hand, skeleton, angles, *still), angles
+    return still_markers(hand, skeleton, angles), angles
+
+
+def still_markers(hand: Hand, skeleton: Array, angles: Array) -> Array:
+    """`[N, M, 3]` metres, hand frame: the hand's markers on the bones `[..., 21, 3]` at `angles
+    [N, 26]`."""
+    eye = jnp.broadcast_to(jnp.eye(3), (len(angles), 3, 3))
+    skeleton = jnp.asarray(skeleton, jnp.float32)
+    return markers(hand, skeleton, angles, eye, jnp.zeros((len(angles), 3)))
 
 
 def minimum_jerk(part: Array) -> Array:

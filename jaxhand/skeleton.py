@@ -7,8 +7,8 @@ import numpy as np
 
 from jaxhand.geometry import apart, product
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, FINGERS, JOINTS, Hand
-from numpy_infer.skeleton import CROSS, CROSS_SQUARED, JOINT_AXES, SIGNS, SLOTS
+from numpy_infer.hand import JOINTS, Hand
+from numpy_infer.skeleton import CROSS, CROSS_SQUARED, EULER, JOINT_AXES, SIGNS, SLOTS
 
 
 def rotations_from_angles(angles: Array) -> Array:
@@ -37,9 +37,7 @@ def angles_from_rotations(rotations: Array) -> Array:
     about_y = jnp.arctan2(m[..., 0, 2], jnp.sqrt(m[..., 0, 0] ** 2 + m[..., 0, 1] ** 2))
     about_z = jnp.arctan2(-m[..., 0, 1], m[..., 0, 0])
     euler = jnp.stack([about_x, about_y, about_z], -1)
-    joints = [JOINTS.index(angle.joint) - 1 for angle in ANGLES]
-    axis = ["xyz".index(angle.axis) for angle in ANGLES]
-    return euler[..., np.array(joints), np.array(axis)] * jnp.asarray(SIGNS).astype(rotations.dtype)
+    return euler[..., *EULER] * jnp.asarray(SIGNS).astype(rotations.dtype)
 
 
 def forward_kinematics(
@@ -57,25 +55,18 @@ def forward_kinematics(
         positions `[..., 21, 3]` metres, world; rotations `[..., 16, 3, 3]` world_from_joint.
     """
     batch = rotations.shape[:-3]
-    fingers = len(FINGERS)
-    local = rotations.reshape(*batch, fingers, 3, 3, 3)
-    bones = jnp.concatenate(
-        [
-            skeleton[..., 1:16, :].reshape(*skeleton.shape[:-2], fingers, 3, 3),
-            skeleton[..., 16:, None, :],
-        ],
-        -2,
-    )
     wrist = jnp.broadcast_to(wrist_position[..., None, :], (*batch, 1, 3))
     wrist_turn = jnp.broadcast_to(wrist_rotation[..., None, :, :], (*batch, 1, 3, 3))
     turn, place = wrist_turn, wrist
     turns, places = [], []
     for level in range(3):
-        place = place + product(turn, bones[..., level, :, None])[..., 0]
-        turn = apart(product(turn, local[..., level, :, :]))
+        # The fingers' joints of one level, all at once.
+        here = slice(1 + level, len(JOINTS), 3)
+        place = place + product(turn, skeleton[..., here, :, None])[..., 0]
+        turn = apart(product(turn, rotations[..., level::3, :, :]))
         turns.append(turn)
         places.append(place)
-    tips = place + product(turn, bones[..., 3, :, None])[..., 0]
+    tips = place + product(turn, skeleton[..., len(JOINTS) :, :, None])[..., 0]
     joints = jnp.stack(places, -2).reshape(*batch, 15, 3)
     finger_turns = jnp.stack(turns, -3).reshape(*batch, 15, 3, 3)
     return (

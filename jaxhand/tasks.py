@@ -15,11 +15,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhand import simulation
 from jaxhand.geometry import kabsch, untransform
 from jaxhand.networks import arrays_of, build, predict
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
-from numpy_infer.hand import CHAINS, Hand
+from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, Hand
 from numpy_infer.networks import Dense, Network, Spec
 
 JOINT_POINTS = tuple(point for chain in CHAINS for point in chain[1:])
@@ -48,7 +49,9 @@ class Task(NamedTuple):
     weight: Array | None
     """`[N]` how often a frame is drawn."""
     prepare: Callable[[Array, Any], tuple[Array, Array]]
-    """(key, frames) → scaled inputs `[N, in]` and targets `[N, out]`."""
+    """(key, frames) → scaled inputs `[N, in]` and targets `[N, …]`."""
+    loss: Callable[[Array, Array], Array]
+    """Scaled outputs `[B, out]` and targets `[B, …]` → what is minimised. A pytree."""
     measure: Callable[[dict[str, Array]], tuple[Array, Array]]
     """Weights → validation loss, and mean error in metres."""
 
@@ -127,8 +130,17 @@ def marker_task(
         frames=markers,
         weight=_weight(training),
         prepare=hide,
+        loss=mean_square,
         measure=partial(_marker_error, network=network, visible=visible, truth=truth),
     )
+
+
+def _mean_square(outputs: Array, targets: Array) -> Array:
+    return ((outputs - targets) ** 2).mean()
+
+
+mean_square = jax.tree_util.Partial(_mean_square)
+"""The paper's loss (section 3.4)."""
 
 
 def as_is(key: Array, frames: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -144,46 +156,167 @@ def joint_points(skeleton: Array, angles: Array) -> Array:
     return positions[:, np.array(JOINT_POINTS)]
 
 
+class Augmentation(NamedTuple):
+    """How the joint network's frames are made more than were recorded."""
+
+    mixed: float
+    """Share of frames in which each finger is taken from another frame."""
+    drawn: float
+    """Share of frames that are drawn postures, on the training skeleton."""
+
+
+def mix_fingers(key: Array, hand: Hand, markers: Array, angles: Array) -> tuple[Array, Array]:
+    """Makes frames of fingers from different frames, each with its markers and its angles.
+
+    Args:
+        hand: says which finger carries a marker; those on the wrist stay.
+        markers: `[N, M, 3]` metres, hand frame, where fingers do not depend on each other.
+        angles: `[N, 26]` radians.
+    """
+    finger_of_marker = np.array([FINGER_OF_JOINT[link] for link in hand.links])
+    finger_of_angle = np.array([FINGER_OF_JOINT[JOINTS.index(a.joint)] for a in ANGLES])
+    for finger in range(len(FINGERS)):
+        order = jax.random.permutation(jax.random.fold_in(key, finger), len(markers))
+        own = (finger_of_marker == finger)[:, None]
+        markers = jnp.where(own, markers[order], markers)
+        angles = jnp.where(finger_of_angle == finger, angles[order], angles)
+    return markers, angles
+
+
+FINGER_OF_JOINT = (-1, *np.repeat(np.arange(len(FINGERS)), 3).tolist())
+"""For each joint of `hand.JOINTS` the index of its finger in `FINGERS`; −1 for the wrist."""
+
+
+@partial(jax.jit, static_argnames="augmentation")
+def _joint_frames(
+    key: Array,
+    frames: tuple[Array, Array],
+    augmentation: Augmentation,
+    hand: Hand,
+    network: Network,
+    point_scale: Array,
+) -> tuple[Array, Array]:
+    markers, angles = frames
+    mix_key, share_key, draw_key = jax.random.split(key, 3)
+    share = jax.random.uniform(share_key, (len(markers), 1))
+    if augmentation.mixed:
+        mixed, mixed_angles = mix_fingers(mix_key, hand, markers, angles)
+        chosen = share < augmentation.mixed
+        markers = jnp.where(chosen[..., None], mixed, markers)
+        angles = jnp.where(chosen, mixed_angles, angles)
+    if augmentation.drawn:
+        drawn_angles = simulation.poses(draw_key, (len(markers),))
+        drawn = simulation.still_markers(hand, hand.skeleton, drawn_angles)
+        chosen = share > 1 - augmentation.drawn
+        markers = jnp.where(chosen[..., None], drawn, markers)
+        angles = jnp.where(chosen, drawn_angles, angles)
+    inputs = (markers.reshape(len(markers), -1) - network.input_mean) / network.input_scale
+    return inputs, _joint_targets(angles, hand.skeleton, network, point_scale)
+
+
+def _joint_targets(angles: Array, skeleton: Array, network: Network, point_scale: Array) -> Array:
+    """`[N, 26 + 45]` scaled angles, then the scaled joint positions that they make."""
+    scaled = (angles - network.output_mean) / network.output_scale
+    points = joint_points(jnp.asarray(skeleton, jnp.float32), angles) / point_scale
+    return jnp.concatenate([scaled, points.reshape(len(angles), -1)], -1)
+
+
+def _joint_loss(
+    outputs: Array,
+    targets: Array,
+    weight: Array,
+    skeleton: Array,
+    network: Network,
+    point_scale: Array,
+) -> Array:
+    """MSE of the scaled angles (paper, section 3.4) and `weight` times that of the scaled joint
+    positions, through forward kinematics."""
+    scaled, points = targets[:, : len(ANGLES)], targets[:, len(ANGLES) :]
+    angles = network.output_mean + network.output_scale * outputs
+    found = joint_points(skeleton, angles).reshape(points.shape) / point_scale
+    return ((outputs - scaled) ** 2).mean() + weight * ((found - points) ** 2).mean()
+
+
+def _angle_loss(outputs: Array, targets: Array) -> Array:
+    return ((outputs - targets[:, : len(ANGLES)]) ** 2).mean()
+
+
 @jax.jit
 def _joint_error(
-    weights: dict[str, Array], network: Network, skeleton: Array, inputs: Array, truth: Array
+    weights: dict[str, Array],
+    network: Network,
+    skeleton: Array,
+    inputs: Array,
+    truth: Array,
+    targets: Array,
+    loss: Callable[[Array, Array], Array],
 ) -> tuple[Array, Array]:
     predicted = predict(replace(network, arrays=weights), inputs, jnp.ones(inputs.shape, bool))
-    loss = (((predicted - truth) / network.output_scale) ** 2).mean()
-    return loss, _lengths(joint_points(skeleton, predicted) - joint_points(skeleton, truth)).mean()
+    scaled = (predicted - network.output_mean) / network.output_scale
+    off = joint_points(skeleton, predicted) - joint_points(skeleton, truth)
+    return loss(scaled, targets), _lengths(off).mean()
 
 
-def joint_task(training: Frames, validation: Frames, hand: Hand, key: Array, hidden: Spec) -> Task:
+def joint_task(
+    training: Frames,
+    validation: Frames,
+    hand: Hand,
+    key: Array,
+    hidden: Spec,
+    position_weight: float,
+    augmentation: Augmentation,
+) -> Task:
     """The joint network: markers as registered by the alignment markers → the 26 angles."""
-    inputs, angles, weight = _aligned(training, hand)
+    markers, angles, weight = _aligned(training, hand)
     held_out, truth, _ = _aligned(validation, hand)
+    inputs = markers.reshape(len(markers), -1)
     mean, scale = inputs.mean(0), (inputs - inputs.mean(0)).std()
     # One number for all angles: what hardly moves, or was not observed, must not count as much as
     # what moves the fingertips.
     angle_mean, angle_scale = angles.mean(0), (angles - angles.mean(0)).std()
     network = _untrained(hidden, mean, scale, angle_mean, angle_scale, key)
     skeleton = jnp.asarray(hand.skeleton, jnp.float32)
+    points = joint_points(skeleton, angles)
+    point_scale = (points - points.mean(0)).std()
+    loss = jax.tree_util.Partial(_angle_loss)
+    if position_weight:
+        loss = jax.tree_util.Partial(
+            _joint_loss,
+            weight=jnp.float32(position_weight),
+            skeleton=skeleton,
+            network=replace(network, arrays={}),
+            point_scale=point_scale,
+        )
+    shared = {"network": replace(network, arrays={}), "point_scale": point_scale}
     return Task(
         name="joint_network",
         network=network,
-        frames=((inputs - mean) / scale, (angles - angle_mean) / angle_scale),
+        frames=(markers, angles),
         weight=weight,
-        prepare=as_is,
+        prepare=partial(_joint_frames, augmentation=augmentation, hand=hand, **shared),
+        loss=loss,
         measure=partial(
-            _joint_error, network=network, skeleton=skeleton, inputs=held_out, truth=truth
+            _joint_error,
+            network=network,
+            skeleton=skeleton,
+            inputs=held_out.reshape(len(held_out), -1),
+            truth=truth,
+            targets=_joint_targets(truth, skeleton, **shared),
+            loss=loss,
         ),
     )
 
 
 def _aligned(frames: Frames, hand: Hand) -> tuple[Array, Array, Array | None]:
-    """Inputs `[N, 3M]` metres, angles `[N, 26]` and weights of the frames with joint truth."""
+    """Markers `[N, M, 3]` metres, hand frame, angles `[N, 26]` and weights of the frames with joint
+    truth."""
     known = np.isfinite(np.asarray(frames.angles)).all(-1)
     angles = jnp.asarray(np.asarray(frames.angles)[known], jnp.float32)
     markers = jnp.asarray(np.asarray(frames.markers)[known], jnp.float32)
     alignment = jnp.broadcast_to(jnp.asarray(hand.alignment_weight), markers.shape[:-1])
     aligned = register(jnp.asarray(hand.template, jnp.float32), markers, alignment)
     weight = _weight(frames)
-    return aligned.reshape(len(aligned), -1), angles, weight if weight is None else weight[known]
+    return aligned, angles, weight if weight is None else weight[known]
 
 
 def _untrained(

@@ -135,7 +135,6 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     weight = visible.astype(markers.dtype)
     template = jnp.asarray(model.hand.template, markers.dtype)
     tracking = second_extent(markers, weight) > DETERMINED_EXTENT
-    fresh = tracking & ~state.tracked
     both = visible & state.visible
     shift = mean_point(markers - state.markers, both.astype(markers.dtype))
     rotation, translation = apart(_register(state, template, markers, weight, tracking, shift))
@@ -159,7 +158,7 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     correction = jnp.where(restart, redone[0], correction)
     anchor = jnp.where(restart, redone[1], anchor)
     seen = jnp.where((changed & tracking & state.tracked)[..., None, None], redone[2], seen)
-    begin = (fresh | ~state.tracked)[..., None, None]
+    begin = ~state.tracked[..., None, None]
     correction = jnp.where(begin, 0, correction)
     anchor = jnp.where(begin, registered, anchor)
     seen = jnp.where(begin & ~visible[..., None], template, seen)

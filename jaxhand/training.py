@@ -29,7 +29,7 @@ from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
 from jaxhand.options import DataSets, Takes
 from jaxhand.sequences import Dataset, complete_frames
-from jaxhand.tasks import Frames, Task, joint_task, marker_task
+from jaxhand.tasks import Augmentation, Frames, Task, joint_task, marker_task, mean_square
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, Hand, load_hand
 from numpy_infer.model import Model
@@ -39,6 +39,14 @@ ADAM = optax.scale_by_adam()
 
 SAVE_SECONDS = 5.0
 """A checkpoint is written when the last one is older: a machine that goes down takes no more."""
+
+PAPER_JOINTS: dict[str, Any] = {
+    "joint_layers": (Dense(200), Dropout(0.1), Dense(200), Dropout(0.1), Dense(200)),
+    "position_weight": 0.0,
+    "mixed": 0.0,
+    "drawn": 0.0,
+}
+"""The paper's joint network (sections 3.3 and 3.4) as fields of `TrainingConfig`."""
 
 Report = Callable[["Metrics"], None]
 
@@ -103,10 +111,20 @@ class TrainingConfig:
     marker_layers: Layers = (Dense(200), Dense(150), Dense(200))
     """Hidden layers of the marker network: units with ReLU, dropouts as parts of 1 (200,0.1,200),
     or a JSON file; a linear layer follows."""
-    joint_layers: Layers = (Dense(200), Dropout(0.1), Dense(200), Dropout(0.1), Dense(200))
+    joint_layers: Layers = (Dense(200), Dense(200), Dense(200))
     """Hidden layers of the joint network, likewise."""
     joints: bool = True
     """Train the joint network too, where the data have joint truth."""
+    position_weight: float = 30.0
+    """Weight of the joints' positions, through forward kinematics, in the joint network's loss
+    beside the mean square of its angles."""
+    mixed: float = 1.0
+    """Share of the joint network's frames in which each finger is taken from another frame."""
+    drawn: float = 0.0
+    """Share of its frames that are drawn postures, on the training data's skeleton."""
+    paper_joints: bool = False
+    """Train the joint network by the paper's plain recipe instead: layers 200,0.1,200,0.1,200, the
+    mean square of the angles, frames as they were recorded."""
     occlusions: tuple[float, ...] = (0.70, 0.17, 0.08, 0.05)
     """Probabilities that 1, 2, 3, … markers are hidden."""
     batch: int = 32
@@ -134,6 +152,12 @@ class TrainingConfig:
             raise ValueError(f"learning_rate: expected above 0, found {self.learning_rate}")
         if min(self.occlusions, default=-1) < 0 or abs(sum(self.occlusions) - 1) > 1e-6:
             raise ValueError(f"occlusions: expected parts that sum to 1, found {self.occlusions}")
+        if not 0 <= self.position_weight < math.inf:
+            raise ValueError(f"position_weight: expected 0 or more, found {self.position_weight}")
+        if not (self.mixed >= 0 and self.drawn >= 0 and self.mixed + self.drawn <= 1):
+            raise ValueError(
+                f"mixed and drawn: expected parts of 1, found {self.mixed} and {self.drawn}"
+            )
         if self.resume and self.overwrite:
             raise ValueError("resume and overwrite exclude each other")
         if (self.train or self.validation) and len(self.data) != 1:
@@ -192,7 +216,10 @@ class Fit(NamedTuple):
 
 
 def epoch_function(
-    spec: Spec, batch: int, prepare: Callable[[Array, Any], tuple[Array, Array]]
+    spec: Spec,
+    batch: int,
+    prepare: Callable[[Array, Any], tuple[Array, Array]],
+    loss: Callable[[Array, Array], Array] = mean_square,
 ) -> Callable[..., tuple[dict[str, Array], Any, Array]]:
     """One epoch, all of it on the device.
 
@@ -213,7 +240,7 @@ def epoch_function(
         drawn = _draw(draw_key, frames, weight, batch)
         inputs, targets = prepare(prepare_key, drawn)
         rate = jnp.float32(learning_rate)
-        return _scan(spec, batch, weights, moments, rate, dropout_key, inputs, targets)
+        return _scan(spec, batch, loss, weights, moments, rate, dropout_key, inputs, targets)
 
     return epoch
 
@@ -230,6 +257,7 @@ def _draw(key: Array, frames: Any, weight: Array | None, batch: int) -> Any:
 def _scan(
     spec: Spec,
     batch: int,
+    loss_of: Callable[[Array, Array], Array],
     weights: dict[str, Array],
     moments: Any,
     learning_rate: Array,
@@ -238,7 +266,7 @@ def _scan(
     targets: Array,
 ) -> tuple[dict[str, Array], Any, Array]:
     def mean_loss(weights: dict[str, Array], inputs: Array, targets: Array, key: Array) -> Array:
-        return ((from_arrays(spec, weights)(inputs, key) - targets) ** 2).mean()
+        return loss_of(from_arrays(spec, weights)(inputs, key), targets)
 
     def step(carry: Any, data: Any) -> tuple[Any, Array]:
         weights, moments = carry
@@ -280,13 +308,22 @@ def fit_networks(
         ValueError: misshapen or too few frames, or no loss was finite.
         KeyboardInterrupt: before the end of the first epoch, when there is nothing to keep.
     """
+    if config.paper_joints:
+        config = replace(config, **PAPER_JOINTS)
     if not config.joints:
         training, validation = (x._replace(angles=None) for x in (training, validation))
     _check_frames("training", training, hand, config.batch)
     _check_frames("validation", validation, hand, 1)
     tasks = [partial(marker_task, hidden=config.marker_layers, occlusions=config.occlusions)]
     if training.angles is not None and validation.angles is not None:
-        tasks.append(partial(joint_task, hidden=config.joint_layers))
+        tasks.append(
+            partial(
+                joint_task,
+                hidden=config.joint_layers,
+                position_weight=config.position_weight,
+                augmentation=Augmentation(config.mixed, config.drawn),
+            )
+        )
     networks: dict[str, Any] = {}
     summary: dict[str, Any] = {"frames": len(training.markers), "interrupted": False}
     for number, make in enumerate(tasks):
@@ -322,7 +359,7 @@ def _fit(
     task: Task, config: TrainingConfig, key: Array, report: Report, folder: Path | None
 ) -> tuple[Fit, bool]:
     """Trains one network; True if it was interrupted."""
-    run = epoch_function(task.network.spec, config.batch, task.prepare)
+    run = epoch_function(task.network.spec, config.batch, task.prepare, task.loss)
     weights = dict(task.network.arrays)
     fit = Fit(0, weights, ADAM.init(weights), weights, Plateau(config.learning_rate))
     with runs.checkpoints(folder, task.name) as checkpoints:

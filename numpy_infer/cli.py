@@ -148,6 +148,8 @@ def _inspect(options: argparse.Namespace) -> None:
     print()
     for name, missing in report["hands"].items():
         lacks = f"lacks {', '.join(missing)}" if missing else "fits"
+        if len(missing) == len(load_hand(name)):
+            lacks = f"has none of its {len(missing)} labels here"
         print(f"hand {name}: {lacks}")
 
 

@@ -40,7 +40,7 @@ def centre(points: Array, weight: Array) -> tuple[Array, Array]:
 
 def transform(rotation: Array, translation: Array, points: Array) -> Array:
     """`[..., N, 3]` points moved by `[..., 3, 3]`, `[..., 3]`: `points @ rotation.T + t`."""
-    return points @ np.swapaxes(rotation, -1, -2) + translation[..., None, :]
+    return points @ rotation.swapaxes(-1, -2) + translation[..., None, :]
 
 
 def untransform(rotation: Array, translation: Array, points: Array) -> Array:
@@ -62,7 +62,7 @@ def second_extent(points: Array, weight: Array) -> Array:
     """`[...]` second singular value of the weighted, centred `[..., N, 3]` points, in metres: 0 for
     collinear points."""
     centred = (points - _shares(weight) @ points) * np.sqrt(weight)[..., None]
-    return np.linalg.svd(centred, compute_uv=False)[..., 1]
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(centred.swapaxes(-1, -2) @ centred)[..., 1], 0))
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -98,14 +98,14 @@ def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[A
     shares = _shares(weight)
     source_mean, target_mean = shares @ source, shares @ target
     centred = (target - target_mean) * weight[..., None]
-    covariance = np.swapaxes(centred, -1, -2) @ (source - source_mean)
+    covariance = centred.swapaxes(-1, -2) @ (source - source_mean)
     left, extents, right = np.linalg.svd(covariance)
     # Twice is enough: `prior_weight` measures at least 1/√3 of the second singular value.
     if (extents[..., 1] < 2 * PRIOR_STRENGTH).any():
         weighed = covariance + prior_weight(covariance)[..., None, None] * prior
         left, _, right = np.linalg.svd(weighed)
     rotation = _proper(left, right)
-    return rotation, (target_mean - source_mean @ np.swapaxes(rotation, -1, -2))[..., 0, :]
+    return rotation, (target_mean - source_mean @ rotation.swapaxes(-1, -2))[..., 0, :]
 
 
 def prior_weight(covariance: Array) -> Array:

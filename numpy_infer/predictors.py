@@ -232,7 +232,7 @@ def learned_step(
         registration = kabsch(template, measured, visible.astype(markers.dtype), eye)
     flat = (*visible.shape[:-1], 3 * visible.shape[-1])
     registered = untransform(*registration, measured).reshape(flat)
-    known = np.broadcast_to(visible[..., None], markers.shape).reshape(flat)
+    known = np.repeat(visible, 3, -1)
     outputs = predict(network, registered, known).reshape(markers.shape)
     return state, np.where(visible[..., None], markers, transform(*registration, outputs))
 

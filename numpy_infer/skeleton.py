@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, FINGERS, JOINTS, THUMB_AXES, Hand
+from numpy_infer.hand import ANGLES, JOINTS, POINTS, THUMB_AXES, Hand
 
 
 def _axis(letter: str, joint: str) -> list[float]:
@@ -33,18 +33,32 @@ JOINT_AXES = np.stack(
 )
 """`[15, 3, 3]` the joints' own axes in the flat hand, as columns."""
 
+EULER = (
+    np.array([JOINTS.index(angle.joint) - 1 for angle in ANGLES]),
+    np.array(["xyz".index(angle.axis) for angle in ANGLES]),
+)
+"""`[26]` each: the finger joint of each angle, and its axis."""
+
+# Gathered once for all frames; no angle, slot 26, turns about nothing.
+_NONE = np.zeros((1, 3, 3))
+_SLOT_CROSS = np.concatenate([CROSS, _NONE])[SLOTS]
+_SLOT_SQUARED = np.concatenate([CROSS_SQUARED, _NONE])[SLOTS]
+_SLOT_SIGNS = np.append(SIGNS, 0)[SLOTS]
+_SLOT_ANGLES = np.minimum(SLOTS, len(ANGLES) - 1)
+_EYE = np.eye(3)
+_AXES_BACK = np.swapaxes(JOINT_AXES, -1, -2)
+
 
 def rotations_from_angles(angles: Array) -> Array:
     """`[..., 26]` radians, in the order of `hand.ANGLES` → `[..., 15, 3, 3]` parent_from_joint of
     the finger joints (Rodrigues' formula, composed in table order)."""
-    signed = (angles * SIGNS.astype(angles.dtype))[..., None, None]
-    cross = CROSS.astype(angles.dtype, copy=False)
-    squared = CROSS_SQUARED.astype(angles.dtype, copy=False)
-    eye = np.eye(3, dtype=angles.dtype)
-    single = eye + np.sin(signed) * cross + (1 - np.cos(signed)) * squared
-    none = np.broadcast_to(eye, single[..., :1, :, :].shape)
-    single = np.concatenate([single, none], -3)
-    first, second, third = (single[..., slot, :, :] for slot in SLOTS)
+    dtype = angles.dtype
+    signed = angles[..., _SLOT_ANGLES] * _SLOT_SIGNS.astype(dtype)
+    signed = signed[..., None, None]
+    single = np.sin(signed) * _SLOT_CROSS.astype(dtype, copy=False)
+    single += (1 - np.cos(signed)) * _SLOT_SQUARED.astype(dtype, copy=False)
+    single += _EYE.astype(dtype, copy=False)
+    first, second, third = (single[..., slot, :, :, :] for slot in range(3))
     return first @ second @ third
 
 
@@ -55,15 +69,13 @@ def angles_from_rotations(rotations: Array) -> Array:
     A rotation that a joint's angles cannot express loses the part they lack. The middle angle of
     the three, abduction, lies in ±π/2: there flexion and twist are one motion and not told apart.
     """
-    axes = JOINT_AXES.astype(rotations.dtype)
-    m = np.swapaxes(axes, -1, -2) @ rotations @ axes
-    about_x = np.arctan2(-m[..., 1, 2], m[..., 2, 2])
-    about_y = np.arctan2(m[..., 0, 2], np.sqrt(m[..., 0, 0] ** 2 + m[..., 0, 1] ** 2))
-    about_z = np.arctan2(-m[..., 0, 1], m[..., 0, 0])
-    euler = np.stack([about_x, about_y, about_z], -1)
-    joints = [JOINTS.index(angle.joint) - 1 for angle in ANGLES]
-    axis = ["xyz".index(angle.axis) for angle in ANGLES]
-    return euler[..., joints, axis] * SIGNS.astype(rotations.dtype)
+    dtype = rotations.dtype
+    m = _AXES_BACK.astype(dtype, copy=False) @ rotations @ JOINT_AXES.astype(dtype, copy=False)
+    euler = np.empty(m.shape[:-1], dtype)
+    euler[..., 0] = np.arctan2(-m[..., 1, 2], m[..., 2, 2])
+    euler[..., 1] = np.arctan2(m[..., 0, 2], np.sqrt(m[..., 0, 0] ** 2 + m[..., 0, 1] ** 2))
+    euler[..., 2] = np.arctan2(-m[..., 0, 1], m[..., 0, 0])
+    return euler[..., *EULER] * SIGNS.astype(dtype)
 
 
 def forward_kinematics(
@@ -80,32 +92,20 @@ def forward_kinematics(
     Returns:
         positions `[..., 21, 3]` metres, world; rotations `[..., 16, 3, 3]` world_from_joint.
     """
-    batch = rotations.shape[:-3]
-    fingers = len(FINGERS)
-    local = rotations.reshape(*batch, fingers, 3, 3, 3)
-    bones = np.concatenate(
-        [
-            skeleton[..., 1:16, :].reshape(*skeleton.shape[:-2], fingers, 3, 3),
-            skeleton[..., 16:, None, :],
-        ],
-        -2,
-    )
-    wrist = np.broadcast_to(wrist_position[..., None, :], (*batch, 1, 3))
-    wrist_turn = np.broadcast_to(wrist_rotation[..., None, :, :], (*batch, 1, 3, 3))
-    turn, place = wrist_turn, wrist
-    turns, places = [], []
+    batch, dtype = rotations.shape[:-3], rotations.dtype
+    positions = np.empty((*batch, len(POINTS), 3), dtype)
+    turns = np.empty((*batch, len(JOINTS), 3, 3), dtype)
+    positions[..., 0, :], turns[..., 0, :, :] = wrist_position, wrist_rotation
+    turn, place = turns[..., :1, :, :], positions[..., :1, :]
     for level in range(3):
-        place = place + (turn @ bones[..., level, :, None])[..., 0]
-        turn = turn @ local[..., level, :, :]
-        turns.append(turn)
-        places.append(place)
-    tips = place + (turn @ bones[..., 3, :, None])[..., 0]
-    joints = np.stack(places, -2).reshape(*batch, 15, 3)
-    finger_turns = np.stack(turns, -3).reshape(*batch, 15, 3, 3)
-    return (
-        np.concatenate([wrist, joints, tips], -2),
-        np.concatenate([wrist_turn, finger_turns], -3),
-    )
+        # The fingers' joints of one level, all at once.
+        here = slice(1 + level, len(JOINTS), 3)
+        place = place + (turn @ skeleton[..., here, :, None])[..., 0]
+        turn = turn @ rotations[..., level::3, :, :]
+        positions[..., here, :], turns[..., here, :, :] = place, turn
+    tips = slice(len(JOINTS), len(POINTS))
+    positions[..., tips, :] = place + (turn @ skeleton[..., tips, :, None])[..., 0]
+    return positions, turns
 
 
 def marker_positions(hand: Hand, positions: Array, rotations: Array) -> Array:

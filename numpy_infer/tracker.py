@@ -125,16 +125,11 @@ def step(
     if state.right.any():
         markers = np.where(state.right[..., None, None], mirror(markers), markers)
     late = ~(dt > 0)
-    elapsed = np.where(late, 0, np.minimum(dt, LONGEST)).astype(dtype)
-    repeated = (
-        late
-        & state.known.any(-1)
-        & (visible == state.visible).all(-1)
-        & (markers == state.markers).all((-1, -2))
-    )
+    elapsed = np.where(late, 0, np.minimum(dt, LONGEST)).astype(dtype, copy=False)
     new_state = _track(model, state, markers, visible, elapsed)
-    if repeated.any():
-        new_state = _where(repeated, state, new_state)
+    if late.any():
+        same = (visible == state.visible).all(-1) & (markers == state.markers).all((-1, -2))
+        new_state = _where(late & state.known.any(-1) & same, state, new_state)
     return new_state, _to_side(new_state, _notice(new_state, late))
 
 
@@ -143,33 +138,38 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     weight = visible.astype(markers.dtype)
     template = model.hand.template.astype(markers.dtype, copy=False)
     tracking = second_extent(markers, weight) > DETERMINED_EXTENT
-    fresh = tracking & ~state.tracked
-    both = visible & state.visible
-    shift = mean_point(markers - state.markers, both.astype(markers.dtype))
-    rotation, translation = _register(state, template, markers, weight, tracking, shift)
-    # Before there was any output the template stands in for it.
-    placed = transform(rotation, translation, template)
-    last = np.where(state.tracked[..., None, None], state.pose.markers, placed)
+    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
+    correction, anchor, seen = state.correction, state.anchor, state.seen
+    # In most frames all hands are tracked as in the frame before, and need none of the rest.
+    steady = bool(tracking.all()) and not changed.any()
+    if steady:
+        rotation, translation = kabsch(template, markers, weight, state.rotation)
+        last = state.pose.markers
+    else:
+        both = (visible & state.visible).astype(markers.dtype)
+        shift = mean_point(markers - state.markers, both)
+        rotation, translation = _register(state, template, markers, weight, tracking, shift)
+        # Before there was any output the template stands in for it.
+        placed = transform(rotation, translation, template)
+        last = np.where(state.tracked[..., None, None], state.pose.markers, placed)
     advance, raw = _fill(
         model, state.predictor, markers, visible, last, dt, (rotation, translation)
     )
-    held = np.where(state.tracked[..., None, None], last + shift[..., None, :], placed)
-    raw = np.where(tracking[..., None, None], raw, held)
-    raw = np.where(visible[..., None], markers, raw)
+    if not steady:
+        held = np.where(state.tracked[..., None, None], last + shift[..., None, :], placed)
+        raw = np.where(tracking[..., None, None], raw, held)
+        raw = np.where(visible[..., None], markers, raw)
     registered = untransform(rotation, translation, raw)
-
-    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
-    correction, anchor, seen = state.correction, state.anchor, state.seen
-    if changed.any():
+    if not steady:
         redone = _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
         restart = (changed & state.tracked)[..., None, None]
         correction = np.where(restart, redone[0], correction)
         anchor = np.where(restart, redone[1], anchor)
         seen = np.where((changed & tracking & state.tracked)[..., None, None], redone[2], seen)
-    begin = (fresh | ~state.tracked)[..., None, None]
-    correction = np.where(begin, 0, correction)
-    anchor = np.where(begin, registered, anchor)
-    seen = np.where(begin & ~visible[..., None], template, seen)
+        begin = ~state.tracked[..., None, None]
+        correction = np.where(begin, 0, correction)
+        anchor = np.where(begin, registered, anchor)
+        seen = np.where(begin & ~visible[..., None], template, seen)
     seen = np.where(visible[..., None], registered, seen)
 
     if model.continuity:
@@ -345,13 +345,16 @@ def _expected_error(model: Model, visible: Array, age: Array) -> Array:
     """`[..., M]` metres, from the model's table by number hidden and age."""
     if visible.all():
         return np.zeros_like(age)
-    table = np.asarray(model.expected_error, age.dtype)
-    hidden = (~visible).sum(-1)
-    row = table[np.clip(hidden, 1, len(table)) - 1][..., None, :]
-    ages = np.array(ERROR_AGES, age.dtype)
-    share = np.clip((age[..., None] - ages[:-1]) / (ages[1:] - ages[:-1]), 0, 1)
+    table = model.expected_error.astype(age.dtype, copy=False)
+    row = table[np.clip((~visible).sum(-1), 1, len(table)) - 1][..., None, :]
+    share = (age[..., None] - _AGES[:-1].astype(age.dtype, copy=False)) / _AGE_STEPS
+    share = np.minimum(np.maximum(share, 0), 1).astype(age.dtype, copy=False)
     error = row[..., 0] + ((row[..., 1:] - row[..., :-1]) * share).sum(-1)
     return np.where(visible, 0, error)
+
+
+_AGES = np.array(ERROR_AGES)
+_AGE_STEPS = np.diff(_AGES)
 
 
 def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from jaxhand.tasks import Frames  # noqa: E402
 from jaxhand.training import Plateau, TrainingConfig, fit_networks  # noqa: E402
 from numpy_infer import model as model_file  # noqa: E402
 from numpy_infer.geometry import kabsch, untransform  # noqa: E402
-from numpy_infer.hand import load_hand  # noqa: E402
+from numpy_infer.hand import ANGLES, FINGERS, JOINTS, load_hand  # noqa: E402
 from numpy_infer.networks import Dense, Dropout  # noqa: E402
 
 HAND = load_hand("glove9")
@@ -180,6 +180,79 @@ def test_frames_of_more_weight_are_drawn_more_often() -> None:
         jax.effects_barrier()
         assert abs(np.mean(drawn[-1] < 2000) - share) < 0.03
     assert len(np.unique(drawn[-1])) == 4000
+
+
+# --- what the joint network learns
+
+
+def joint_task(weight: float = 1.0, mixed: float = 0.0, drawn: float = 0.0) -> tasks.Task:
+    augmentation = tasks.Augmentation(mixed, drawn)
+    key = jax.random.key(0)
+    return tasks.joint_task(
+        TRAINING, VALIDATION, HAND, key, CONFIG.joint_layers, weight, augmentation
+    )
+
+
+def test_mixed_frames_are_made_of_whole_fingers_and_keep_their_palm() -> None:
+    markers, angles = joint_task().frames
+    mixed, mixed_angles = tasks.mix_fingers(jax.random.key(4), HAND, markers, angles)
+    palm = [i for i, link in enumerate(HAND.links) if link == 0]
+    np.testing.assert_array_equal(mixed[:, palm], markers[:, palm])
+    sources = []
+    for finger in FINGERS:
+        own_angles = [i for i, a in enumerate(ANGLES) if a.joint.startswith(finger)]
+        own_markers = [i for i, link in enumerate(HAND.links) if JOINTS[link].startswith(finger)]
+        same = (np.asarray(mixed_angles)[:, None, own_angles] == angles[None, :, own_angles]).all(
+            -1
+        )
+        source = same.argmax(-1)
+        assert same.any(-1).all()
+        np.testing.assert_array_equal(mixed[:, own_markers], markers[source][:, own_markers])
+        sources.append(source)
+    assert (np.ptp(sources, axis=0) > 0).mean() > 0.95
+
+
+@pytest.mark.parametrize(("mixed", "drawn"), [(0.0, 0.0), (1.0, 0.0), (0.0, 1.0), (0.3, 0.3)])
+def test_the_joint_network_is_shown_markers_that_its_target_angles_make(
+    mixed: float, drawn: float
+) -> None:
+    """Forward kinematics of the targets gives the inputs, whatever was mixed or drawn."""
+    task = joint_task(mixed=mixed, drawn=drawn)
+    network = task.network
+    inputs, targets = map(np.asarray, task.prepare(jax.random.key(1), task.frames))
+    angles = network.output_mean + network.output_scale * targets[:, :26]
+    skeleton = HAND.skeleton.astype(np.float32)
+    still = np.eye(3, dtype=np.float32), np.zeros(3, np.float32)
+    points = forward_kinematics(skeleton, rotations_from_angles(angles), *still)
+    markers = np.asarray(marker_positions(HAND, *points)).reshape(len(inputs), -1)
+    shown = network.input_mean + network.input_scale * inputs
+    np.testing.assert_allclose(shown, markers, atol=2e-4)
+    spread = targets[:, 26:].std() / (points[0][:, np.array(tasks.JOINT_POINTS)]).std()
+    np.testing.assert_allclose(
+        targets[:, 26:].reshape(len(inputs), 15, 3) / spread,
+        points[0][:, np.array(tasks.JOINT_POINTS)],
+        atol=1e-4,
+    )
+
+
+def test_the_joint_loss_is_angles_and_weighed_positions() -> None:
+    task, plain = joint_task(weight=3.0), joint_task(weight=0.0)
+    _, targets = task.prepare(jax.random.key(1), task.frames)
+    exact = targets[:, :26]
+    assert float(task.loss(exact, targets)) < 1e-8
+    off = exact + 0.1
+    angle_part = float(plain.loss(off, targets))
+    assert angle_part == pytest.approx(0.01, rel=1e-3)
+    position_part = (float(task.loss(off, targets)) - angle_part) / 3
+    again = (float(joint_task(weight=6.0).loss(off, targets)) - angle_part) / 6
+    assert position_part == pytest.approx(again, rel=1e-3)
+    assert position_part > 1e-4
+
+
+def test_the_papers_recipe_is_a_preset() -> None:
+    model, _ = fit(replace(CONFIG, paper_joints=True, epochs=1))
+    spec = model.joint_network.spec
+    assert spec == (*training.PAPER_JOINTS["joint_layers"], Dense(26, "linear"))
 
 
 # --- how it is learned
