@@ -255,15 +255,14 @@ def _hands(options: argparse.Namespace) -> None:
 def _hand_over(verb: str, arguments: list[str]) -> int:
     found = entry_points(group="jaxhand.verbs", name=verb)
     try:
-        run = next(iter(found)).load()
-    except ImportError as error:
+        status: int = next(iter(found)).load()(arguments)
+    except ModuleNotFoundError as error:
         print(
             f"jaxhand {verb} needs more than numpy ({error.name} is not installed): "
             "pip install 'jaxhand[train]'",
             file=sys.stderr,
         )
         return 2
-    status: int = run(arguments)
     return status
 
 

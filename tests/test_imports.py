@@ -16,6 +16,7 @@ from types import ModuleType
 import pytest
 
 import numpy_infer
+from numpy_infer.cli import VERBS
 
 ROOT = Path(numpy_infer.__file__).resolve().parents[1]
 
@@ -92,6 +93,26 @@ def test_no_line_of_the_runtime_imports_more_not_even_later(name: str) -> None:
         elif isinstance(node, ast.ImportFrom) and not node.level:
             found.add((node.module or "").partition(".")[0])
     assert found <= set(sys.stdlib_module_names) | {"numpy", "numpy_infer"}
+
+
+WITHOUT = """
+import sys
+for name in ("jax", "flax", "optax", "tyro", "rich", "orbax"):
+    sys.modules[name] = None  # as if not installed
+from numpy_infer.cli import main
+sys.exit(main(["VERB"]))
+"""
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_that_needs_more_than_numpy_says_what_to_install(verb: str) -> None:
+    code = WITHOUT.replace("VERB", verb)
+    run = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 2, run.stderr
+    assert "pip install 'jaxhand[train]'" in run.stderr
+    assert run.stderr.count("\n") == 1
 
 
 # -- twins -------------------------------------------------------------------------------------

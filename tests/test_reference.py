@@ -119,7 +119,7 @@ def test_a_network_of_ours_gives_the_same_after_a_trip_through_their_format(
 
 def test_a_network_with_a_mean_cannot_be_written_in_their_format(tmp_path: Path) -> None:
     """Theirs sets hidden coordinates to 0."""
-    with pytest.raises(ValueError, match="train with mean 0"):
+    with pytest.raises(ValueError, match="expects the mean of its training data"):
         authors_model.write_marker_network(scaled_network(27, mean=1), tmp_path / "no.bin")
     assert not (tmp_path / "no.bin").exists()
 

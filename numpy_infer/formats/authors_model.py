@@ -89,7 +89,7 @@ def write_marker_network(network: Network, path: str | Path) -> None:
     if np.any(network.input_mean != 0):
         raise ValueError(
             "their program hides a marker by setting its coordinates to 0; this network expects "
-            "the mean of its training data: train with mean 0 to export it"
+            "the mean of its training data instead"
         )
     kernel, bias = _last(network)
     arrays = dict(network.arrays)
