@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhand.geometry import product
+from jaxhand.geometry import product, solve
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, POINTS
@@ -137,7 +137,7 @@ def _fit_frame(skeleton: Array, points: Array, weight: Array) -> FitResult:
         rows = _jacobian(residuals, state.angles)
         gradient = (rows * residuals(state.angles)[:, None]).sum(-1)
         matrix = product(rows, jnp.swapaxes(rows, -1, -2))
-        move = _solve(matrix + state.damping[:, None, None] * jnp.eye(_WIDTH), gradient)
+        move = solve(matrix + state.damping[:, None, None] * jnp.eye(_WIDTH), gradient)
         angles = state.angles - move[_FINGER, _SLOT]
         cost = (residuals(angles) ** 2).sum(-1)
         better = cost < state.cost
@@ -218,13 +218,3 @@ def _jacobian(residuals: Callable[[Array], Array], angles: Array) -> Array:
         return residuals(angles + slots[_SLOT])
 
     return jnp.swapaxes(jax.jacfwd(moved)(jnp.zeros(_WIDTH, angles.dtype)), -1, -2)
-
-
-def _solve(matrix: Array, right: Array) -> Array:
-    """`[5, 6]` solution of positive definite `[5, 6, 6]` systems by Gauss-Jordan elimination, which
-    needs no pivots there; unrolled, for LAPACK would be called once for each small matrix."""
-    table = jnp.concatenate([matrix, right[..., None]], -1)
-    for k in range(_WIDTH):
-        row = table[:, k] / table[:, k, k, None]
-        table = (table - table[:, :, k, None] * row[:, None]).at[:, k].set(row)
-    return table[..., -1]

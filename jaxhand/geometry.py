@@ -101,19 +101,14 @@ def determinant(matrix: Array) -> Array:
 
 
 def solve(matrix: Array, vector: Array) -> Array:
-    """`[..., 3]` x with `matrix @ x = vector`, for a symmetric positive `[..., 3, 3]` matrix."""
-    a, b, c = (matrix[..., i, 0] for i in range(3))
-    d, e, f = matrix[..., 1, 1], matrix[..., 2, 1], matrix[..., 2, 2]
-    # L D Lᵀ: stable where cofactors, in float32, are not.
-    ba, ca = b / a, c / a
-    d2, e2 = d - ba * b, e - ba * c
-    ed = e2 / d2
-    f3 = f - ca * c - ed * e2
-    x, y, z = (vector[..., i] for i in range(3))
-    y = y - ba * x
-    z = (z - ca * x - ed * y) / f3
-    y = y / d2 - ed * z
-    return jnp.stack([x / a - ba * y - ca * z, y, z], -1)
+    """`[..., N]` x with `matrix @ x = vector`, for a symmetric positive `[..., N, N]` matrix.
+    Gauss-Jordan elimination, which needs no pivots there; LAPACK would be called for each matrix.
+    """
+    table = jnp.concatenate([matrix, vector[..., None]], -1)
+    for k in range(matrix.shape[-1]):
+        row = apart(table[..., k, :] / table[..., k, k, None])
+        table = (table - table[..., :, k, None] * row[..., None, :]).at[..., k, :].set(row)
+    return table[..., -1]
 
 
 def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[Array, Array]:
@@ -203,6 +198,38 @@ def _rotation(q: tuple[Array, ...]) -> tuple[tuple[Array, ...], ...]:
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
         (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     )
+
+
+def rotation_from_vector(vector: Array) -> Array:
+    """`[..., 3]` rotation vectors, radians → `[..., 3, 3]` (Rodrigues' formula). Right at and near
+    no rotation, where the axis is not known: what it multiplies vanishes there."""
+    angle = jnp.sqrt((vector * vector).sum(-1))[..., None, None]
+    axis = vector / jnp.where(angle > 0, angle, 1)[..., 0]
+    x, y, z = axis[..., 0], axis[..., 1], axis[..., 2]
+    zero = jnp.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    crossing = jnp.stack([jnp.stack(row, -1) for row in rows], -2)
+    turned = jnp.sin(angle) * crossing + (1 - jnp.cos(angle)) * product(crossing, crossing)
+    return turned + jnp.eye(3, dtype=vector.dtype)
+
+
+def shortest_arc(source: Array, target: Array, share: Array) -> Array:
+    """`[..., 3, 3]` the least rotation that turns the direction of `source` into that of `target`,
+    or the `share [...]` of it in 0 to 1.
+
+    Vectors `[..., 3]` without length turn nothing. Between opposite ones every half turn is least:
+    the one about the coordinate axis farthest from them, made perpendicular, is taken.
+    """
+    crossed = cross(source, target)
+    sine = jnp.sqrt((crossed * crossed).sum(-1))
+    cosine = (source * target).sum(-1)
+    farthest = jnp.eye(3, dtype=source.dtype)[jnp.argmin(jnp.abs(source), -1)]
+    aside = cross(source, farthest)
+    opposite = (sine <= 1e-6 * jnp.abs(cosine)) & (cosine < 0)
+    axis = jnp.where(opposite[..., None], aside, crossed)
+    length = jnp.sqrt((axis * axis).sum(-1))
+    angle = share * jnp.arctan2(sine, cosine)
+    return rotation_from_vector(axis * (angle / jnp.where(length > 0, length, 1))[..., None])
 
 
 def quaternion(rotation: Array) -> Array:

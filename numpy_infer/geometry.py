@@ -76,7 +76,7 @@ def determinant(matrix: Array) -> Array:
 
 
 def solve(matrix: Array, vector: Array) -> Array:
-    """`[..., 3]` x with `matrix @ x = vector`, for a symmetric positive `[..., 3, 3]` matrix."""
+    """`[..., N]` x with `matrix @ x = vector`, for a symmetric positive `[..., N, N]` matrix."""
     return np.linalg.solve(matrix, vector[..., None])[..., 0]
 
 
@@ -130,6 +130,38 @@ def _proper(left: Array, right: Array) -> Array:
         last = 2 * (left[..., :, 2:] @ right[..., 2:, :])
         product = np.where(reflected[..., None, None], product - last, product)
     return product
+
+
+def rotation_from_vector(vector: Array) -> Array:
+    """`[..., 3]` rotation vectors, radians → `[..., 3, 3]` (Rodrigues' formula). Right at and near
+    no rotation, where the axis is not known: what it multiplies vanishes there."""
+    angle: Array = np.sqrt((vector * vector).sum(-1))[..., None, None]
+    axis = vector / np.where(angle > 0, angle, 1)[..., 0]
+    x, y, z = axis[..., 0], axis[..., 1], axis[..., 2]
+    zero = np.zeros_like(x)
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    crossing = np.stack([np.stack(row, -1) for row in rows], -2)
+    turned = np.sin(angle) * crossing + (1 - np.cos(angle)) * crossing @ crossing
+    return turned + np.eye(3, dtype=vector.dtype)
+
+
+def shortest_arc(source: Array, target: Array, share: Array) -> Array:
+    """`[..., 3, 3]` the least rotation that turns the direction of `source` into that of `target`,
+    or the `share [...]` of it in 0 to 1.
+
+    Vectors `[..., 3]` without length turn nothing. Between opposite ones every half turn is least:
+    the one about the coordinate axis farthest from them, made perpendicular, is taken.
+    """
+    crossed = cross(source, target)
+    sine = np.sqrt((crossed * crossed).sum(-1))
+    cosine = (source * target).sum(-1)
+    farthest: Array = np.eye(3, dtype=source.dtype)[np.argmin(np.abs(source), -1)]
+    aside = cross(source, farthest)
+    opposite = (sine <= 1e-6 * np.abs(cosine)) & (cosine < 0)
+    axis: Array = np.where(opposite[..., None], aside, crossed)
+    length = np.sqrt((axis * axis).sum(-1))
+    angle = share * np.arctan2(sine, cosine)
+    return rotation_from_vector(axis * (angle / np.where(length > 0, length, 1))[..., None])
 
 
 def quaternion(rotation: Array) -> Array:

@@ -159,6 +159,17 @@ class Hand:
         weight[list(self.alignment)] = 1
         return weight
 
+    @cached_property
+    def finger_markers(self) -> tuple[tuple[int, ...], ...]:
+        """For each finger of `FINGERS` the indices of the markers it carries, from its base out."""
+        carried: tuple[list[int], ...] = tuple([] for _ in FINGERS)
+        for marker, link in enumerate(self.links):
+            if link > 0:
+                carried[(link - 1) // 3].append(marker)
+        return tuple(
+            tuple(sorted(own, key=lambda i: (self.links[i], self.joints[i]))) for own in carried
+        )
+
     @property
     def bone_lengths(self) -> dict[str, float]:
         """Metres from each point's parent to it, without the wrist."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from numpy_infer.arrays import Array
+from numpy_infer.geometry import cross, rotation_from_vector, shortest_arc, solve
 from numpy_infer.hand import ANGLES, JOINTS, POINTS, THUMB_AXES, Hand
 
 
@@ -47,6 +48,12 @@ _SLOT_SIGNS = np.append(SIGNS, 0)[SLOTS]
 _SLOT_ANGLES = np.minimum(SLOTS, len(ANGLES) - 1)
 _EYE = np.eye(3)
 _AXES_BACK = np.swapaxes(JOINT_AXES, -1, -2)
+
+THUMB_NOISE, THUMB_PRIOR = 1e-3, 0.2
+"""Metres and radians: how far a marker may be off, and how far one of the thumb's angles."""
+
+THUMB_ANGLES = np.stack(EULER)[:, [angle.joint.startswith("thumb") for angle in ANGLES]]
+"""`[2, 6]` which of the thumb's three joints each of its angles turns, and about which axis."""
 
 
 def rotations_from_angles(angles: Array) -> Array:
@@ -114,3 +121,82 @@ def marker_positions(hand: Hand, positions: Array, rotations: Array) -> Array:
     offsets = hand.offsets.astype(positions.dtype)[..., None]
     links = rotations[..., list(hand.links), :, :]
     return positions[..., list(hand.joints), :] + (links @ offsets)[..., 0]
+
+
+def flat_calibrated(rotations: Array, flat: Array) -> Array:
+    """`[..., 15, 3, 3]` parent_from_joint as the flat pose calibrates it (paper, section 2.2): the
+    inverse of what is predicted while the user holds a flat hand, composed onto each prediction.
+
+    Args:
+        rotations: `[..., 15, 3, 3]` parent_from_joint as predicted.
+        flat: `[15, 3, 3]` as predicted for the flat hand.
+    """
+    return flat.swapaxes(-1, -2) @ rotations
+
+
+def align_fingers(
+    hand: Hand, local: Array, positions: Array, rotations: Array, markers: Array, weight: Array
+) -> Array:
+    """Turns each finger about its base until its outermost marker points to where it was measured
+    (paper, section 2.2: finger alignment).
+
+    The paper's middle of the last phalanx is that for a marker placed there. Here the marker's own
+    modelled point is taken, so that joints which are right stay as they are, wherever the marker
+    sits. For what that leaves at the thumb see `align_thumb`.
+
+    Args:
+        hand: its markers and their offsets.
+        local: `[..., 15, 3, 3]` parent_from_joint of the finger joints.
+        positions: `[..., 21, 3]` metres, world, as `forward_kinematics` makes them of `local`.
+        rotations: `[..., 16, 3, 3]` world_from_joint, likewise.
+        markers: `[..., M, 3]` metres, world; finite where the weight is not 0.
+        weight: `[..., M]` in 0 to 1: the share of the arc that a marker is worth.
+
+    Returns:
+        `[..., 15, 3, 3]` parent_from_joint.
+    """
+    ends = np.array([own[-1] if own else -1 for own in hand.finger_markers])
+    base = positions[..., 1:16:3, :]
+    modelled = marker_positions(hand, positions, rotations)[..., ends, :] - base
+    share = weight[..., ends] * (ends >= 0).astype(weight.dtype)
+    measured = np.where(share[..., None] > 0, markers[..., ends, :] - base, modelled)
+    turn = shortest_arc(modelled, measured, share)
+    wrist = rotations[..., :1, :, :]
+    turn = wrist.swapaxes(-1, -2) @ turn @ wrist
+    local = local.copy()
+    local[..., ::3, :, :] = turn @ local[..., ::3, :, :]
+    return local
+
+
+def align_thumb(
+    hand: Hand, local: Array, positions: Array, rotations: Array, markers: Array, weight: Array
+) -> Array:
+    """Bends the thumb at all of its joints towards where its markers were measured.
+
+    One rotation at the base, as the paper has it, falls short in a pinch (section 8): there the
+    tip's distance from the base is wrong too. After `align_fingers` a damped Gauss-Newton step over
+    the thumb's angles, about its joints' own axes as they stand, with `THUMB_NOISE` and
+    `THUMB_PRIOR`. Takes and gives what `align_fingers` does.
+    """
+    own = np.array(hand.finger_markers[0], int)
+    if not len(own):
+        return local
+    modelled = marker_positions(hand, positions, rotations)[..., own, :]
+    pull = weight[..., own, None]
+    off = np.where(pull > 0, markers[..., own, :] - modelled, 0) * pull
+    axes = rotations[..., 1:4, :, :] @ JOINT_AXES[:3].astype(local.dtype, copy=False)
+    axes = axes.swapaxes(-1, -2)[..., THUMB_ANGLES[0], THUMB_ANGLES[1], :]
+    arms = modelled[..., None, :, :] - positions[..., 1 + THUMB_ANGLES[0], None, :]
+    carried = np.array(hand.links)[own] > THUMB_ANGLES[0][:, None]
+    reach = pull[..., None, :, :] * carried[..., None].astype(local.dtype)
+    slopes = cross(axes[..., None, :], arms) * reach
+    slopes = slopes.reshape(*slopes.shape[:-2], -1)
+    damping = (THUMB_NOISE / THUMB_PRIOR) ** 2 * np.eye(len(THUMB_ANGLES[0]), dtype=local.dtype)
+    gradient = (slopes @ off.reshape(*off.shape[:-2], -1, 1))[..., 0]
+    bend = solve(slopes @ slopes.swapaxes(-1, -2) + damping, gradient)
+    vectors = np.zeros((*bend.shape[:-1], 3, 3), local.dtype)
+    vectors[..., THUMB_ANGLES[0], THUMB_ANGLES[1]] = bend
+    vectors = (JOINT_AXES[:3].astype(local.dtype, copy=False) @ vectors[..., None])[..., 0]
+    local = local.copy()
+    local[..., :3, :, :] = local[..., :3, :, :] @ rotation_from_vector(vectors)
+    return local
