@@ -5,6 +5,7 @@ Points are rows, rotations act on columns: `world = hand @ rotation.T + translat
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -111,7 +112,9 @@ def solve(matrix: Array, vector: Array) -> Array:
     return table[..., -1]
 
 
-def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[Array, Array]:
+def kabsch(
+    source: Array, target: Array, weight: Array, prior: Array | Callable[[], Array]
+) -> tuple[Array, Array]:
     """Rigid motion that takes `source` to `target` with least weighted squares (paper, equation 2).
 
     Args:
@@ -120,7 +123,8 @@ def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[A
         weight: `[..., N]`, not negative; points of weight 0 must be finite and do not matter.
         prior: `[..., 3, 3]` a rotation. What the points leave open (0, 1, 2 or collinear points)
             follows it, continuously: it enters with a strength that falls to 0 as the points
-            spread out, see `PRIOR_STRENGTH`. It must turn with the data to keep equivariance.
+            spread out, see `PRIOR_STRENGTH`. It must turn with the data to keep equivariance. A
+            function is called where it is needed.
 
     Returns:
         `rotation [..., 3, 3]` with determinant +1, `translation [..., 3]`. Without points the
@@ -129,6 +133,7 @@ def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[A
     source_mean, target_mean = apart((mean_point(source, weight), mean_point(target, weight)))
     centred = (target - target_mean[..., None, :]) * weight[..., None]
     covariance = apart(inner(centred, source - source_mean[..., None, :]))
+    prior = prior() if callable(prior) else prior
     weighed = apart(covariance + prior_weight(covariance)[..., None, None] * prior)
     rotation = apart(nearest_rotation(weighed))
     moved = product(rotation, source_mean[..., None])[..., 0]

@@ -22,8 +22,8 @@ for _kind, _data, _meta in (
     ),
     (
         Model,
-        ("hand", "marker_network", "joint_network", "fade", "expected_error"),
-        ("predictor", "joints", "continuity"),
+        ("hand", "wearer", "flat", "marker_network", "joint_network", "fade", "expected_error"),
+        ("predictor", "joints", "alignment", "continuity"),
     ),
 ):
     jax.tree_util.register_dataclass(_kind, _data, _meta, drop_fields=["training"])

@@ -1,8 +1,8 @@
 """The pipeline of one frame, as pure `init` and `step`. Twin of `numpy_infer.tracker`.
 
 Register the visible markers → fill the hidden ones → continuity → hand pose from the alignment
-markers → joint angles → forward kinematics. (The gate before and calibration and finger alignment
-after are the identity as yet.)
+markers → joint angles → calibration → forward kinematics → finger alignment. (The
+gate before is the identity as yet.)
 
 Continuity is a blend at the output. `raw` is measured where visible and predicted from measured
 markers where hidden; in the registered frame `output = raw + correction`. While the visible set is
@@ -32,9 +32,15 @@ from jaxhand.geometry import (
 )
 from jaxhand.networks import predict
 from jaxhand.predictors import PREDICTORS, learned_step
-from jaxhand.skeleton import angles_from_rotations, forward_kinematics, rotations_from_angles
+from jaxhand.skeleton import (
+    align_fingers,
+    align_thumb,
+    angles_from_rotations,
+    flat_calibrated,
+    forward_kinematics,
+    rotations_from_angles,
+)
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES
 from numpy_infer.model import ERROR_AGES, Model
 from numpy_infer.networks import Network
 from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
@@ -95,6 +101,7 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         known=never,
         correction=jnp.zeros_like(template),
         anchor=template,
+        prior=eye,
         age=jnp.zeros((*batch, count), dtype),
     )
 
@@ -137,7 +144,10 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     tracking = second_extent(markers, weight) > DETERMINED_EXTENT
     both = visible & state.visible
     shift = mean_point(markers - state.markers, both.astype(markers.dtype))
-    rotation, translation = apart(_register(state, template, markers, weight, tracking, shift))
+    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
+    rotation, translation = apart(
+        _register(state, template, markers, weight, changed, tracking, shift)
+    )
     # Before there was any output the template stands in for it.
     placed = transform(rotation, translation, template)
     last = jnp.where(state.tracked[..., None, None], state.pose.markers, placed)
@@ -149,7 +159,6 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     raw = jnp.where(visible[..., None], markers, raw)
     registered = apart(untransform(rotation, translation, raw))
 
-    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
     correction, anchor, seen = state.correction, state.anchor, state.seen
     redone = apart(
         _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
@@ -159,6 +168,8 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     anchor = jnp.where(restart, redone[1], anchor)
     seen = jnp.where((changed & tracking & state.tracked)[..., None, None], redone[2], seen)
     begin = ~state.tracked[..., None, None]
+    prior = jnp.where(restart, redone[3], state.prior)
+    prior = jnp.where(begin, product(rotation.swapaxes(-1, -2), state.rotation), prior)
     correction = jnp.where(begin, 0, correction)
     anchor = jnp.where(begin, registered, anchor)
     seen = jnp.where(begin & ~visible[..., None], template, seen)
@@ -185,23 +196,40 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
         known=state.known | visible,
         correction=correction,
         anchor=anchor,
+        prior=prior,
         age=age,
     )
     return new_state._replace(pose=_pose(model, new_state, raw))
 
 
 def _register(
-    state: State, template: Array, markers: Array, weight: Array, tracking: Array, shift: Array
+    state: State,
+    template: Array,
+    markers: Array,
+    weight: Array,
+    changed: Array,
+    tracking: Array,
+    shift: Array,
 ) -> tuple[Array, Array]:
     """`world_from_template` of the visible markers; where they do not determine it, the previous
     one moved along with them, and before there was one, the template at their mean."""
-    found_rotation, found_translation = kabsch(template, markers, weight, state.rotation)
+    found_rotation, found_translation = kabsch(
+        template, markers, weight, lambda: _carried_prior(state, markers, weight, changed)
+    )
     seen_any = (weight > 0).any(-1)[..., None]
     centred = mean_point(markers, weight) - mean_point(template, weight)
     start = jnp.where(seen_any, centred, state.translation)
     moved = jnp.where(state.tracked[..., None], state.translation + shift, start)
     rotation = jnp.where(tracking[..., None, None], found_rotation, state.rotation)
     return rotation, jnp.where(tracking[..., None], found_translation, moved)
+
+
+def _carried_prior(state: State, markers: Array, weight: Array, changed: Array) -> Array:
+    """`[..., 3, 3]` world_from_template that the registration follows where the template's visible
+    markers are near a line. The previous rotation would not do while the set stays the same: each
+    frame would give it up a little more, and a hand that stands still would turn."""
+    turn, _ = kabsch(state.anchor, markers, weight, state.rotation)
+    return jnp.where(changed[..., None, None], state.rotation, product(turn, state.prior))
 
 
 def _fill(
@@ -230,14 +258,14 @@ def _redo(
     last: Array,
     rotation: Array,
     translation: Array,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """The previous frame, done with this frame's visible set.
 
     A marker hidden then takes its position of now, carried back by the hand's motion since.
 
     Returns:
         `[..., M, 3]` each, registered frame: the correction, the anchor, and where each marker was
-        seen last.
+        seen last; `[..., 3, 3]` the prior, see `State`.
     """
     dtype = markers.dtype
     template = jnp.asarray(model.hand.template, dtype)
@@ -259,7 +287,12 @@ def _redo(
     raw = jnp.where((tracking[..., None] | visible)[..., None], filled, last)
     correction = untransform(*then, last) - untransform(*then, raw)
     seen = untransform(rotation, translation, transform(turn, move, before))
-    return correction, untransform(*then, previous), seen
+    return (
+        correction,
+        untransform(*then, previous),
+        seen,
+        product(then_rotation.swapaxes(-1, -2), prior),
+    )
 
 
 def _motion(
@@ -312,7 +345,7 @@ def _blend(
 
 def _pose(model: Model, state: State, output: Array) -> HandPose:
     """The output of a frame, for a left hand, from its markers `[..., M, 3]`."""
-    template = jnp.asarray(model.hand.template, output.dtype)
+    template = jnp.asarray(model.body.template, output.dtype)
     alignment = jnp.broadcast_to(
         jnp.asarray(model.hand.alignment_weight, output.dtype), output.shape[:-1]
     )
@@ -348,21 +381,45 @@ def _expected_error(model: Model, visible: Array, age: Array) -> Array:
 
 
 def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> dict[str, Any]:
-    """The joint stage (paper, section 3.3) on all markers and the wrist's pose."""
+    """The joint stage (paper, section 3.3) on all markers and the wrist's pose, with calibration
+    and finger alignment (section 2.2).
+
+    Hidden markers turn their fingers as seen ones do: so the joints follow from the output markers
+    alone, are as continuous as those, and stand still when they do.
+    """
     if model.joints == "none":
         return {"angles": None, "rotations": None, "positions": None}
     network: Network = model.joint_network  # type: ignore[assignment]
-    features = untransform(rotation, position, markers)
+    own = untransform(rotation, position, markers)
+    features = own if model.wearer is None else _registered_as_trained(model, own)
     features = features.reshape(*features.shape[:-2], -1)
-    angles = predict(network, features, jnp.ones(features.shape, bool))
-    local = rotations_from_angles(angles)
-    skeleton = jnp.asarray(model.hand.skeleton, markers.dtype)
+    local = rotations_from_angles(predict(network, features, jnp.ones(features.shape, bool)))
+    if model.flat is not None:
+        local = flat_calibrated(local, jnp.asarray(model.flat, local.dtype))
+    skeleton = jnp.asarray(model.body.skeleton, markers.dtype)
+    if model.alignment:
+        # In the hand frame: far from the origin float32 is too coarse for it.
+        still = jnp.eye(3, dtype=markers.dtype), jnp.zeros(3, markers.dtype)
+        for align in (align_fingers, align_thumb):
+            placed = forward_kinematics(skeleton, local, *still)
+            local = align(model.body, local, *placed, own, jnp.ones_like(own[..., 0]))
     positions, rotations = forward_kinematics(skeleton, local, rotation, position)
     return {
-        "angles": angles_from_rotations(local).reshape(*angles.shape[:-1], len(ANGLES)),
+        "angles": angles_from_rotations(local),
         "rotations": rotations,
         "positions": positions,
     }
+
+
+def _registered_as_trained(model: Model, markers: Array) -> Array:
+    """`[..., M, 3]` metres: the markers in the hand frame of the template that the joint network
+    was trained on, which is not the wearer's."""
+    dtype = markers.dtype
+    template = jnp.asarray(model.hand.template, dtype)
+    alignment = jnp.asarray(model.hand.alignment_weight, dtype)
+    weight = jnp.broadcast_to(alignment, markers.shape[:-1])
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*markers.shape[:-2], 3, 3))
+    return untransform(*kabsch(template, markers, weight, eye), markers)
 
 
 def _notice(state: State, late: Array) -> Array:

@@ -5,6 +5,8 @@ Points are rows, rotations act on columns: `world = hand @ rotation.T + translat
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from numpy_infer.arrays import Array
@@ -80,7 +82,9 @@ def solve(matrix: Array, vector: Array) -> Array:
     return np.linalg.solve(matrix, vector[..., None])[..., 0]
 
 
-def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[Array, Array]:
+def kabsch(
+    source: Array, target: Array, weight: Array, prior: Array | Callable[[], Array]
+) -> tuple[Array, Array]:
     """Rigid motion that takes `source` to `target` with least weighted squares (paper, equation 2).
 
     Args:
@@ -89,7 +93,8 @@ def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[A
         weight: `[..., N]`, not negative; points of weight 0 must be finite and do not matter.
         prior: `[..., 3, 3]` a rotation. What the points leave open (0, 1, 2 or collinear points)
             follows it, continuously: it enters with a strength that falls to 0 as the points
-            spread out, see `PRIOR_STRENGTH`. It must turn with the data to keep equivariance.
+            spread out, see `PRIOR_STRENGTH`. It must turn with the data to keep equivariance. A
+            function is called where it is needed.
 
     Returns:
         `rotation [..., 3, 3]` with determinant +1, `translation [..., 3]`. Without points the
@@ -102,6 +107,7 @@ def kabsch(source: Array, target: Array, weight: Array, prior: Array) -> tuple[A
     left, extents, right = np.linalg.svd(covariance)
     # Twice is enough: `prior_weight` measures at least 1/√3 of the second singular value.
     if (extents[..., 1] < 2 * PRIOR_STRENGTH).any():
+        prior = prior() if callable(prior) else prior
         weighed = covariance + prior_weight(covariance)[..., None, None] * prior
         left, _, right = np.linalg.svd(weighed)
     rotation = _proper(left, right)

@@ -53,6 +53,13 @@ class Model:
     """`[3M]` registered markers, metres → the same; needed by the predictor `learned`."""
     joint_network: Network | None = None
     """`[3M]` markers in the hand frame, metres → `[26]` radians; needed by the stage `learned`."""
+    alignment: bool = True
+    """Turn the fingers towards their markers after the joint network, see `skeleton`."""
+    wearer: Hand | None = None
+    """The same markers on the bones of whoever wears the glove: what joints and wrist pose are made
+    with; None stands for `hand`. Comes from a calibration, not from the model file."""
+    flat: Array | None = None
+    """`[15, 3, 3]` parent_from_joint as predicted of the wearer's flat hand, or None. Likewise."""
     fade: float = 0.03
     """Metres: δ of the continuity blend, see `tracker`."""
     continuity: bool = True
@@ -62,7 +69,17 @@ class Model:
     training: Mapping[str, Any] = field(default_factory=dict)
     """Plain data about how the model was made and measured."""
 
+    @property
+    def body(self) -> Hand:
+        """The hand that joints and wrist pose are made with."""
+        return self.hand if self.wearer is None else self.wearer
+
     def __post_init__(self) -> None:
+        if self.wearer is not None and self.wearer.markers != self.hand.markers:
+            raise ValueError(
+                f"the wearer's markers {', '.join(self.wearer.markers)} are not the model's: "
+                f"{', '.join(self.hand.markers)}"
+            )
         if self.joints not in ("learned", "none"):
             raise ValueError(f"unknown joint stage {self.joints!r}: expected 'learned' or 'none'")
         inputs = 3 * len(self.hand)
@@ -81,8 +98,10 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
 
     Raises:
         ValueError: the file exists and `overwrite` is False; or the model holds what could not be
-            read back.
+            read back, or a calibration, which has a file of its own (`calibration.save`).
     """
+    if model.wearer is not None or model.flat is not None:
+        raise ValueError("a calibrated model is no model file: save the model, and the calibration")
     path = Path(path)
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists: choose another name, or ask to overwrite it")
@@ -100,6 +119,7 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
         "predictor": model.predictor,
         "joints": model.joints,
         "networks": networks,
+        "alignment": bool(model.alignment),
         "fade": float(model.fade),
         "continuity": bool(model.continuity),
         "training": dict(model.training),
@@ -163,7 +183,7 @@ def _read(archive: zipfile.ZipFile) -> Model:
             f"written in version {header.get('version')!r}, this program reads version {VERSION}"
         )
     expected = {"format", "version", "hand", "predictor", "joints", "networks", "fade"}
-    expected |= {"continuity", "training", "checksum"}
+    expected |= {"alignment", "continuity", "training", "checksum"}
     if set(header) != expected or not isinstance(header["networks"], dict):
         raise ValueError(f"damaged header: expected {sorted(expected)}, found {sorted(header)}")
     for name in sorted(set(header["networks"]) - {"marker_network", "joint_network"}):
@@ -189,7 +209,7 @@ def _read(archive: zipfile.ZipFile) -> Model:
     checksum = header.pop("checksum")
     if _checksum(header, arrays) != checksum:
         raise ValueError("the checksum does not fit: the file is damaged")
-    networks = {
+    networks: dict[str, Any] = {
         name: Network(spec, **_gather(arrays, name, array_shapes(spec, 3 * len(hand))))
         for name, spec in specs.items()
     }
@@ -197,6 +217,7 @@ def _read(archive: zipfile.ZipFile) -> Model:
         hand=hand,
         predictor=header["predictor"],
         joints=header["joints"],
+        alignment=header["alignment"],
         fade=header["fade"],
         continuity=header["continuity"],
         expected_error=arrays["expected_error"],
@@ -206,7 +227,8 @@ def _read(archive: zipfile.ZipFile) -> Model:
 
 
 def _check_header(header: Mapping[str, Any]) -> None:
-    kinds = {"predictor": str, "joints": str, "fade": float, "continuity": bool, "training": dict}
+    kinds: dict[str, type] = {"predictor": str, "joints": str, "fade": float, "training": dict}
+    kinds |= {"alignment": bool, "continuity": bool}
     for key, kind in kinds.items():
         if not isinstance(header[key], kind):
             raise ValueError(f"header: expected {key!r} as {kind.__name__}, found {header[key]!r}")

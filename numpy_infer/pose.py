@@ -95,5 +95,8 @@ class State(NamedTuple):
     set."""
     anchor: Array
     """`[..., M, 3]` registered markers when the corrections were set."""
+    prior: Array
+    """`[..., 3, 3]` anchor_from_template before the corrections were set: what the registration
+    follows as long as the visible set is the same, where markers do not determine it."""
     age: Array
     """`[..., M]` seconds since the marker was measured."""

@@ -49,8 +49,9 @@ _SLOT_ANGLES = np.minimum(SLOTS, len(ANGLES) - 1)
 _EYE = np.eye(3)
 _AXES_BACK = np.swapaxes(JOINT_AXES, -1, -2)
 
-THUMB_NOISE, THUMB_PRIOR = 1e-3, 0.2
-"""Metres and radians: how far a marker may be off, and how far one of the thumb's angles."""
+THUMB_NOISE, THUMB_PRIOR = 2e-3, 0.1
+"""Metres and radians: how far a marker may be off, and how far one of the thumb's angles. A
+millimetre of noise can then turn a joint by 1.4 degrees, in the direction least determined."""
 
 THUMB_ANGLES = np.stack(EULER)[:, [angle.joint.startswith("thumb") for angle in ANGLES]]
 """`[2, 6]` which of the thumb's three joints each of its angles turns, and about which axis."""

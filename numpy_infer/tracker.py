@@ -1,8 +1,8 @@
 """The pipeline of one frame, as pure `init` and `step`. Twin of `jaxhand.tracker`.
 
 Register the visible markers → fill the hidden ones → continuity → hand pose from the alignment
-markers → joint angles → forward kinematics. (The gate before and calibration and finger alignment
-after are the identity as yet.)
+markers → joint angles → calibration → forward kinematics → finger alignment. (The
+gate before is the identity as yet.)
 
 Continuity is a blend at the output. `raw` is measured where visible and predicted from measured
 markers where hidden; in the registered frame `output = raw + correction`. While the visible set is
@@ -30,12 +30,19 @@ from numpy_infer.geometry import (
     transform,
     untransform,
 )
-from numpy_infer.hand import ANGLES, Hand
+from numpy_infer.hand import Hand
 from numpy_infer.model import ERROR_AGES, Model, load
 from numpy_infer.networks import Network, predict
 from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
 from numpy_infer.predictors import PREDICTORS, learned_step
-from numpy_infer.skeleton import angles_from_rotations, forward_kinematics, rotations_from_angles
+from numpy_infer.skeleton import (
+    align_fingers,
+    align_thumb,
+    angles_from_rotations,
+    flat_calibrated,
+    forward_kinematics,
+    rotations_from_angles,
+)
 
 SHRINK_SPEED = 0.25
 """m/s at which the correction of a visible marker dies (paper, section 3.2.2)."""
@@ -101,6 +108,7 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         known=never,
         correction=np.zeros_like(template),
         anchor=template,
+        prior=eye,
         age=np.zeros((*batch, count), dtype),
     )
 
@@ -140,15 +148,20 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     tracking = second_extent(markers, weight) > DETERMINED_EXTENT
     changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
     correction, anchor, seen = state.correction, state.anchor, state.seen
+    prior = state.prior
     # In most frames all hands are tracked as in the frame before, and need none of the rest.
     steady = bool(tracking.all()) and not changed.any()
     if steady:
-        rotation, translation = kabsch(template, markers, weight, state.rotation)
+        rotation, translation = kabsch(
+            template, markers, weight, lambda: _carried_prior(state, markers, weight, changed)
+        )
         last = state.pose.markers
     else:
         both = (visible & state.visible).astype(markers.dtype)
         shift = mean_point(markers - state.markers, both)
-        rotation, translation = _register(state, template, markers, weight, tracking, shift)
+        rotation, translation = _register(
+            state, template, markers, weight, changed, tracking, shift
+        )
         # Before there was any output the template stands in for it.
         placed = transform(rotation, translation, template)
         last = np.where(state.tracked[..., None, None], state.pose.markers, placed)
@@ -167,6 +180,8 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
         anchor = np.where(restart, redone[1], anchor)
         seen = np.where((changed & tracking & state.tracked)[..., None, None], redone[2], seen)
         begin = ~state.tracked[..., None, None]
+        prior = np.where(restart, redone[3], prior)
+        prior = np.where(begin, rotation.swapaxes(-1, -2) @ state.rotation, prior)
         correction = np.where(begin, 0, correction)
         anchor = np.where(begin, registered, anchor)
         seen = np.where(begin & ~visible[..., None], template, seen)
@@ -192,23 +207,40 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
         known=state.known | visible,
         correction=correction,
         anchor=anchor,
+        prior=prior,
         age=age,
     )
     return new_state._replace(pose=_pose(model, new_state, raw))
 
 
 def _register(
-    state: State, template: Array, markers: Array, weight: Array, tracking: Array, shift: Array
+    state: State,
+    template: Array,
+    markers: Array,
+    weight: Array,
+    changed: Array,
+    tracking: Array,
+    shift: Array,
 ) -> tuple[Array, Array]:
     """`world_from_template` of the visible markers; where they do not determine it, the previous
     one moved along with them, and before there was one, the template at their mean."""
-    found_rotation, found_translation = kabsch(template, markers, weight, state.rotation)
+    found_rotation, found_translation = kabsch(
+        template, markers, weight, lambda: _carried_prior(state, markers, weight, changed)
+    )
     seen_any = (weight > 0).any(-1)[..., None]
     centred = mean_point(markers, weight) - mean_point(template, weight)
     start = np.where(seen_any, centred, state.translation)
     moved = np.where(state.tracked[..., None], state.translation + shift, start)
     rotation = np.where(tracking[..., None, None], found_rotation, state.rotation)
     return rotation, np.where(tracking[..., None], found_translation, moved)
+
+
+def _carried_prior(state: State, markers: Array, weight: Array, changed: Array) -> Array:
+    """`[..., 3, 3]` world_from_template that the registration follows where the template's visible
+    markers are near a line. The previous rotation would not do while the set stays the same: each
+    frame would give it up a little more, and a hand that stands still would turn."""
+    turn, _ = kabsch(state.anchor, markers, weight, state.rotation)
+    return np.where(changed[..., None, None], state.rotation, turn @ state.prior)
 
 
 def _fill(
@@ -237,14 +269,14 @@ def _redo(
     last: Array,
     rotation: Array,
     translation: Array,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """The previous frame, done with this frame's visible set.
 
     A marker hidden then takes its position of now, carried back by the hand's motion since.
 
     Returns:
         `[..., M, 3]` each, registered frame: the correction, the anchor, and where each marker was
-        seen last.
+        seen last; `[..., 3, 3]` the prior, see `State`.
     """
     dtype = markers.dtype
     template = model.hand.template.astype(dtype, copy=False)
@@ -257,7 +289,7 @@ def _redo(
     # The prior is that of now, carried back too: if only the set has changed, so has nothing else.
     prior = np.swapaxes(turn, -1, -2) @ state.rotation
     found = kabsch(template, previous, visible.astype(dtype), prior)
-    then_rotation = np.where(tracking[..., None, None], found[0], state.rotation)
+    then_rotation: Array = np.where(tracking[..., None, None], found[0], state.rotation)
     then_translation = np.where(tracking[..., None], found[1], state.translation)
     then = (then_rotation, then_translation)
     _, filled = _fill(
@@ -266,7 +298,8 @@ def _redo(
     raw = np.where((tracking[..., None] | visible)[..., None], filled, last)
     correction = untransform(*then, last) - untransform(*then, raw)
     seen = untransform(rotation, translation, transform(turn, move, before))
-    return correction, untransform(*then, previous), seen
+    followed = then_rotation.swapaxes(-1, -2) @ prior
+    return correction, untransform(*then, previous), seen, followed
 
 
 def _motion(
@@ -319,7 +352,7 @@ def _blend(
 
 def _pose(model: Model, state: State, output: Array) -> HandPose:
     """The output of a frame, for a left hand, from its markers `[..., M, 3]`."""
-    template = model.hand.template.astype(output.dtype, copy=False)
+    template = model.body.template.astype(output.dtype, copy=False)
     alignment = model.hand.alignment_weight.astype(output.dtype, copy=False)
     rotation, position = kabsch(template, output, alignment, state.rotation)
     uses_frame = PREDICTORS[model.predictor].uses_frame
@@ -358,21 +391,45 @@ _AGE_STEPS = np.diff(_AGES)
 
 
 def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> dict[str, Any]:
-    """The joint stage (paper, section 3.3) on all markers and the wrist's pose."""
+    """The joint stage (paper, section 3.3) on all markers and the wrist's pose, with calibration
+    and finger alignment (section 2.2).
+
+    Hidden markers turn their fingers as seen ones do: so the joints follow from the output markers
+    alone, are as continuous as those, and stand still when they do.
+    """
     if model.joints == "none":
         return {"angles": None, "rotations": None, "positions": None}
     network: Network = model.joint_network  # type: ignore[assignment]
-    features = untransform(rotation, position, markers)
+    own = untransform(rotation, position, markers)
+    features = own if model.wearer is None else _registered_as_trained(model, own)
     features = features.reshape(*features.shape[:-2], -1)
-    angles = predict(network, features, np.ones(features.shape, bool))
-    local = rotations_from_angles(angles)
-    skeleton = model.hand.skeleton.astype(markers.dtype, copy=False)
+    local = rotations_from_angles(predict(network, features, np.ones(features.shape, bool)))
+    if model.flat is not None:
+        local = flat_calibrated(local, model.flat.astype(local.dtype, copy=False))
+    skeleton = model.body.skeleton.astype(markers.dtype, copy=False)
+    if model.alignment:
+        # In the hand frame: far from the origin float32 is too coarse for it.
+        still = np.eye(3, dtype=markers.dtype), np.zeros(3, markers.dtype)
+        for align in (align_fingers, align_thumb):
+            placed = forward_kinematics(skeleton, local, *still)
+            local = align(model.body, local, *placed, own, np.ones_like(own[..., 0]))
     positions, rotations = forward_kinematics(skeleton, local, rotation, position)
     return {
-        "angles": angles_from_rotations(local).reshape(*angles.shape[:-1], len(ANGLES)),
+        "angles": angles_from_rotations(local),
         "rotations": rotations,
         "positions": positions,
     }
+
+
+def _registered_as_trained(model: Model, markers: Array) -> Array:
+    """`[..., M, 3]` metres: the markers in the hand frame of the template that the joint network
+    was trained on, which is not the wearer's."""
+    dtype = markers.dtype
+    template = model.hand.template.astype(dtype, copy=False)
+    alignment = model.hand.alignment_weight.astype(dtype, copy=False)
+    weight = np.broadcast_to(alignment, markers.shape[:-1])
+    eye = np.broadcast_to(np.eye(3, dtype=dtype), (*markers.shape[:-2], 3, 3))
+    return untransform(*kabsch(template, markers, weight, eye), markers)
 
 
 def _notice(state: State, late: Array) -> Array:

@@ -71,8 +71,9 @@ class Case(NamedTuple):
 
     @property
     def radians(self) -> float:
-        """The promise is 1e-4 rad; in float32 as for `metres`."""
-        return 1e-4 if self.dtype == np.float64 else 1e-3
+        """The promise is 1e-4 rad. In float32 it is what `metres` is over a lever of 2 cm: a finger
+        is turned towards its marker, and a fist's tips are that near to their knuckles."""
+        return 1e-4 if self.dtype == np.float64 else 5e-3
 
     def model(self, **changes: Any) -> Model:
         return _model(self, tuple(sorted(changes.items())))
@@ -713,7 +714,9 @@ def test_a_thousand_frames_with_four_markers_visible_are_the_same_in_jax(predict
     assert_array_equal(theirs.state, ours.state)
     assert_allclose(theirs.expected_error, ours.expected_error, rtol=0, atol=1e-5)
     if ours.angles is not None:
-        assert_allclose(theirs.angles, ours.angles, rtol=0, atol=1e-3)
+        # Not the angles: near 90° of abduction, where this random network goes, they are no
+        # function of the rotations.
+        assert_allclose(theirs.rotations, ours.rotations, rtol=0, atol=1e-3)
         assert_allclose(theirs.positions, ours.positions, rtol=0, atol=1e-4)
 
 
