@@ -30,20 +30,11 @@ from jaxhand.geometry import (
     transform,
     untransform,
 )
-from jaxhand.networks import predict
+from jaxhand.joints import joint_stage
 from jaxhand.predictors import PREDICTORS, learned_step
-from jaxhand.skeleton import (
-    align_fingers,
-    align_thumb,
-    angles_from_rotations,
-    flat_calibrated,
-    forward_kinematics,
-    rotations_from_angles,
-)
 from numpy_infer.arrays import Array
 from numpy_infer.model import ERROR_AGES, Model
-from numpy_infer.networks import Network
-from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
+from numpy_infer.pose import HandPose, Notice, Redone, State, Status, TrackingState
 from numpy_infer.tracker import (
     DETERMINED_EXTENT,
     FARTHEST,
@@ -83,7 +74,7 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         expected_error=jnp.zeros((*batch, count), dtype),
         wrist_rotation=eye,
         wrist_position=origin,
-        **_joints(model, template, eye, origin),
+        **joint_stage(model, template, eye, origin),
         state=lost,
         notice=jnp.zeros(batch, int),
     )
@@ -151,8 +142,12 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     # Before there was any output the template stands in for it.
     placed = transform(rotation, translation, template)
     last = jnp.where(state.tracked[..., None, None], state.pose.markers, placed)
+    redone = apart(
+        _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
+    )
+    before = _registration_before(state, redone, changed, rotation, translation)
     advance, raw = apart(
-        _fill(model, state.predictor, markers, visible, last, dt, (rotation, translation))
+        _fill(model, state.predictor, markers, visible, last, dt, (rotation, translation), before)
     )
     held = jnp.where(state.tracked[..., None, None], last + shift[..., None, :], placed)
     raw = jnp.where(tracking[..., None, None], raw, held)
@@ -160,15 +155,12 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     registered = apart(untransform(rotation, translation, raw))
 
     correction, anchor, seen = state.correction, state.anchor, state.seen
-    redone = apart(
-        _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
-    )
     restart = (changed & state.tracked)[..., None, None]
-    correction = jnp.where(restart, redone[0], correction)
-    anchor = jnp.where(restart, redone[1], anchor)
-    seen = jnp.where((changed & tracking & state.tracked)[..., None, None], redone[2], seen)
+    correction = jnp.where(restart, redone.correction, correction)
+    anchor = jnp.where(restart, redone.anchor, anchor)
+    seen = jnp.where((changed & tracking & state.tracked)[..., None, None], redone.seen, seen)
     begin = ~state.tracked[..., None, None]
-    prior = jnp.where(restart, redone[3], state.prior)
+    prior = jnp.where(restart, redone.prior, state.prior)
     prior = jnp.where(begin, product(rotation.swapaxes(-1, -2), state.rotation), prior)
     correction = jnp.where(begin, 0, correction)
     anchor = jnp.where(begin, registered, anchor)
@@ -240,12 +232,33 @@ def _fill(
     last: Array,
     dt: Array,
     registration: tuple[Array, Array],
+    before: tuple[Array, Array],
 ) -> tuple[Any, Array]:
-    """One step of the model's predictor; the learned one is spared a second registration."""
-    step_of = PREDICTORS[model.predictor].step
-    if step_of is learned_step:
+    """One step of the model's predictor; the learned one is spared a second registration.
+
+    What a predictor that goes by the frame has nothing to say of moves with the hand: from the
+    registration `before`, of the previous frame by the same markers, to that of this frame.
+    """
+    chosen = PREDICTORS[model.predictor]
+    if chosen.step is learned_step:
         return learned_step(model, predictor, markers, visible, last, dt, registration)
-    return step_of(model, predictor, markers, visible, last, dt)
+    if chosen.uses_frame:
+        last = transform(*registration, untransform(*before, last))
+    return chosen.step(model, predictor, markers, visible, last, dt)
+
+
+def _registration_before(
+    state: State, redone: Redone, changed: Array, rotation: Array, translation: Array
+) -> tuple[Array, Array]:
+    """The previous frame's registration by the markers visible now; this frame's own for a hand
+    that had not been tracked."""
+    parts = (
+        (redone.rotation, state.rotation, rotation),
+        (redone.translation, state.translation, translation),
+    )
+    return tuple(
+        _where(state.tracked, _where(changed, again, earlier), now) for again, earlier, now in parts
+    )
 
 
 def _redo(
@@ -258,14 +271,10 @@ def _redo(
     last: Array,
     rotation: Array,
     translation: Array,
-) -> tuple[Array, Array, Array, Array]:
+) -> Redone:
     """The previous frame, done with this frame's visible set.
 
     A marker hidden then takes its position of now, carried back by the hand's motion since.
-
-    Returns:
-        `[..., M, 3]` each, registered frame: the correction, the anchor, and where each marker was
-        seen last; `[..., 3, 3]` the prior, see `State`.
     """
     dtype = markers.dtype
     template = jnp.asarray(model.hand.template, dtype)
@@ -282,17 +291,13 @@ def _redo(
     then_translation = jnp.where(tracking[..., None], found[1], state.translation)
     then = (then_rotation, then_translation)
     _, filled = _fill(
-        model, state.predictor, previous, visible, last, jnp.zeros_like(shift[..., 0]), then
+        model, state.predictor, previous, visible, last, jnp.zeros_like(shift[..., 0]), then, then
     )
     raw = jnp.where((tracking[..., None] | visible)[..., None], filled, last)
     correction = untransform(*then, last) - untransform(*then, raw)
     seen = untransform(rotation, translation, transform(turn, move, before))
-    return (
-        correction,
-        untransform(*then, previous),
-        seen,
-        product(then_rotation.swapaxes(-1, -2), prior),
-    )
+    followed = product(then_rotation.swapaxes(-1, -2), prior)
+    return Redone(*then, correction, untransform(*then, previous), seen, followed)
 
 
 def _motion(
@@ -363,7 +368,7 @@ def _pose(model: Model, state: State, output: Array) -> HandPose:
         expected_error=_expected_error(model, state.visible, state.age),
         wrist_rotation=rotation,
         wrist_position=position,
-        **_joints(model, output, rotation, position),
+        **joint_stage(model, output, rotation, position),
         state=jnp.where(state.tracking, int(TrackingState.TRACKING), degraded),
         notice=jnp.zeros(seen_any.shape, int),
     )
@@ -378,48 +383,6 @@ def _expected_error(model: Model, visible: Array, age: Array) -> Array:
     share = jnp.clip((age[..., None] - ages[:-1]) / (ages[1:] - ages[:-1]), 0, 1)
     error = row[..., 0] + ((row[..., 1:] - row[..., :-1]) * share).sum(-1)
     return jnp.where(visible, 0, error)
-
-
-def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> dict[str, Any]:
-    """The joint stage (paper, section 3.3) on all markers and the wrist's pose, with calibration
-    and finger alignment (section 2.2).
-
-    Hidden markers turn their fingers as seen ones do: so the joints follow from the output markers
-    alone, are as continuous as those, and stand still when they do.
-    """
-    if model.joints == "none":
-        return {"angles": None, "rotations": None, "positions": None}
-    network: Network = model.joint_network  # type: ignore[assignment]
-    own = untransform(rotation, position, markers)
-    features = own if model.wearer is None else _registered_as_trained(model, own)
-    features = features.reshape(*features.shape[:-2], -1)
-    local = rotations_from_angles(predict(network, features, jnp.ones(features.shape, bool)))
-    if model.flat is not None:
-        local = flat_calibrated(local, jnp.asarray(model.flat, local.dtype))
-    skeleton = jnp.asarray(model.body.skeleton, markers.dtype)
-    if model.alignment:
-        # In the hand frame: far from the origin float32 is too coarse for it.
-        still = jnp.eye(3, dtype=markers.dtype), jnp.zeros(3, markers.dtype)
-        for align in (align_fingers, align_thumb):
-            placed = forward_kinematics(skeleton, local, *still)
-            local = align(model.body, local, *placed, own, jnp.ones_like(own[..., 0]))
-    positions, rotations = forward_kinematics(skeleton, local, rotation, position)
-    return {
-        "angles": angles_from_rotations(local),
-        "rotations": rotations,
-        "positions": positions,
-    }
-
-
-def _registered_as_trained(model: Model, markers: Array) -> Array:
-    """`[..., M, 3]` metres: the markers in the hand frame of the template that the joint network
-    was trained on, which is not the wearer's."""
-    dtype = markers.dtype
-    template = jnp.asarray(model.hand.template, dtype)
-    alignment = jnp.asarray(model.hand.alignment_weight, dtype)
-    weight = jnp.broadcast_to(alignment, markers.shape[:-1])
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*markers.shape[:-2], 3, 3))
-    return untransform(*kabsch(template, markers, weight, eye), markers)
 
 
 def _notice(state: State, late: Array) -> Array:

@@ -100,3 +100,17 @@ class State(NamedTuple):
     follows as long as the visible set is the same, where markers do not determine it."""
     age: Array
     """`[..., M]` seconds since the marker was measured."""
+
+
+class Redone(NamedTuple):
+    """The previous frame, done with this frame's visible set."""
+
+    rotation: Array
+    """`[..., 3, 3]` world_from_template."""
+    translation: Array
+    """`[..., 3]` its translation."""
+    correction: Array
+    anchor: Array
+    seen: Array
+    prior: Array
+    """What `State` keeps under these names, but that `seen` is in this frame's registration."""

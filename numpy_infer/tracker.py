@@ -31,18 +31,10 @@ from numpy_infer.geometry import (
     untransform,
 )
 from numpy_infer.hand import Hand
+from numpy_infer.joints import joint_stage
 from numpy_infer.model import ERROR_AGES, Model, load
-from numpy_infer.networks import Network, predict
-from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
+from numpy_infer.pose import HandPose, Notice, Redone, State, Status, TrackingState
 from numpy_infer.predictors import PREDICTORS, learned_step
-from numpy_infer.skeleton import (
-    align_fingers,
-    align_thumb,
-    angles_from_rotations,
-    flat_calibrated,
-    forward_kinematics,
-    rotations_from_angles,
-)
 
 SHRINK_SPEED = 0.25
 """m/s at which the correction of a visible marker dies (paper, section 3.2.2)."""
@@ -90,7 +82,7 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         expected_error=np.zeros((*batch, count), dtype),
         wrist_rotation=eye,
         wrist_position=origin,
-        **_joints(model, template, eye, origin),
+        **joint_stage(model, template, eye, origin),
         state=lost,
         notice=np.zeros(batch, int),
     )
@@ -155,7 +147,7 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
         rotation, translation = kabsch(
             template, markers, weight, lambda: _carried_prior(state, markers, weight, changed)
         )
-        last = state.pose.markers
+        last, before = state.pose.markers, (state.rotation, state.translation)
     else:
         both = (visible & state.visible).astype(markers.dtype)
         shift = mean_point(markers - state.markers, both)
@@ -165,8 +157,10 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
         # Before there was any output the template stands in for it.
         placed = transform(rotation, translation, template)
         last = np.where(state.tracked[..., None, None], state.pose.markers, placed)
+        redone = _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
+        before = _registration_before(state, redone, changed, rotation, translation)
     advance, raw = _fill(
-        model, state.predictor, markers, visible, last, dt, (rotation, translation)
+        model, state.predictor, markers, visible, last, dt, (rotation, translation), before
     )
     if not steady:
         held = np.where(state.tracked[..., None, None], last + shift[..., None, :], placed)
@@ -174,13 +168,12 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
         raw = np.where(visible[..., None], markers, raw)
     registered = untransform(rotation, translation, raw)
     if not steady:
-        redone = _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
         restart = (changed & state.tracked)[..., None, None]
-        correction = np.where(restart, redone[0], correction)
-        anchor = np.where(restart, redone[1], anchor)
-        seen = np.where((changed & tracking & state.tracked)[..., None, None], redone[2], seen)
+        correction = np.where(restart, redone.correction, correction)
+        anchor = np.where(restart, redone.anchor, anchor)
+        seen = np.where((changed & tracking & state.tracked)[..., None, None], redone.seen, seen)
         begin = ~state.tracked[..., None, None]
-        prior = np.where(restart, redone[3], prior)
+        prior = np.where(restart, redone.prior, prior)
         prior = np.where(begin, rotation.swapaxes(-1, -2) @ state.rotation, prior)
         correction = np.where(begin, 0, correction)
         anchor = np.where(begin, registered, anchor)
@@ -251,12 +244,33 @@ def _fill(
     last: Array,
     dt: Array,
     registration: tuple[Array, Array],
+    before: tuple[Array, Array],
 ) -> tuple[Any, Array]:
-    """One step of the model's predictor; the learned one is spared a second registration."""
-    step_of = PREDICTORS[model.predictor].step
-    if step_of is learned_step:
+    """One step of the model's predictor; the learned one is spared a second registration.
+
+    What a predictor that goes by the frame has nothing to say of moves with the hand: from the
+    registration `before`, of the previous frame by the same markers, to that of this frame.
+    """
+    chosen = PREDICTORS[model.predictor]
+    if chosen.step is learned_step:
         return learned_step(model, predictor, markers, visible, last, dt, registration)
-    return step_of(model, predictor, markers, visible, last, dt)
+    if chosen.uses_frame:
+        last = transform(*registration, untransform(*before, last))
+    return chosen.step(model, predictor, markers, visible, last, dt)
+
+
+def _registration_before(
+    state: State, redone: Redone, changed: Array, rotation: Array, translation: Array
+) -> tuple[Array, Array]:
+    """The previous frame's registration by the markers visible now; this frame's own for a hand
+    that had not been tracked."""
+    parts = (
+        (redone.rotation, state.rotation, rotation),
+        (redone.translation, state.translation, translation),
+    )
+    return tuple(
+        _where(state.tracked, _where(changed, again, earlier), now) for again, earlier, now in parts
+    )
 
 
 def _redo(
@@ -269,14 +283,10 @@ def _redo(
     last: Array,
     rotation: Array,
     translation: Array,
-) -> tuple[Array, Array, Array, Array]:
+) -> Redone:
     """The previous frame, done with this frame's visible set.
 
     A marker hidden then takes its position of now, carried back by the hand's motion since.
-
-    Returns:
-        `[..., M, 3]` each, registered frame: the correction, the anchor, and where each marker was
-        seen last; `[..., 3, 3]` the prior, see `State`.
     """
     dtype = markers.dtype
     template = model.hand.template.astype(dtype, copy=False)
@@ -293,13 +303,13 @@ def _redo(
     then_translation = np.where(tracking[..., None], found[1], state.translation)
     then = (then_rotation, then_translation)
     _, filled = _fill(
-        model, state.predictor, previous, visible, last, np.zeros_like(shift[..., 0]), then
+        model, state.predictor, previous, visible, last, np.zeros_like(shift[..., 0]), then, then
     )
     raw = np.where((tracking[..., None] | visible)[..., None], filled, last)
     correction = untransform(*then, last) - untransform(*then, raw)
     seen = untransform(rotation, translation, transform(turn, move, before))
     followed = then_rotation.swapaxes(-1, -2) @ prior
-    return correction, untransform(*then, previous), seen, followed
+    return Redone(*then, correction, untransform(*then, previous), seen, followed)
 
 
 def _motion(
@@ -368,7 +378,7 @@ def _pose(model: Model, state: State, output: Array) -> HandPose:
         expected_error=_expected_error(model, state.visible, state.age),
         wrist_rotation=rotation,
         wrist_position=position,
-        **_joints(model, output, rotation, position),
+        **joint_stage(model, output, rotation, position),
         state=np.where(state.tracking, int(TrackingState.TRACKING), degraded),
         notice=np.zeros(seen_any.shape, int),
     )
@@ -388,48 +398,6 @@ def _expected_error(model: Model, visible: Array, age: Array) -> Array:
 
 _AGES = np.array(ERROR_AGES)
 _AGE_STEPS = np.diff(_AGES)
-
-
-def _joints(model: Model, markers: Array, rotation: Array, position: Array) -> dict[str, Any]:
-    """The joint stage (paper, section 3.3) on all markers and the wrist's pose, with calibration
-    and finger alignment (section 2.2).
-
-    Hidden markers turn their fingers as seen ones do: so the joints follow from the output markers
-    alone, are as continuous as those, and stand still when they do.
-    """
-    if model.joints == "none":
-        return {"angles": None, "rotations": None, "positions": None}
-    network: Network = model.joint_network  # type: ignore[assignment]
-    own = untransform(rotation, position, markers)
-    features = own if model.wearer is None else _registered_as_trained(model, own)
-    features = features.reshape(*features.shape[:-2], -1)
-    local = rotations_from_angles(predict(network, features, np.ones(features.shape, bool)))
-    if model.flat is not None:
-        local = flat_calibrated(local, model.flat.astype(local.dtype, copy=False))
-    skeleton = model.body.skeleton.astype(markers.dtype, copy=False)
-    if model.alignment:
-        # In the hand frame: far from the origin float32 is too coarse for it.
-        still = np.eye(3, dtype=markers.dtype), np.zeros(3, markers.dtype)
-        for align in (align_fingers, align_thumb):
-            placed = forward_kinematics(skeleton, local, *still)
-            local = align(model.body, local, *placed, own, np.ones_like(own[..., 0]))
-    positions, rotations = forward_kinematics(skeleton, local, rotation, position)
-    return {
-        "angles": angles_from_rotations(local),
-        "rotations": rotations,
-        "positions": positions,
-    }
-
-
-def _registered_as_trained(model: Model, markers: Array) -> Array:
-    """`[..., M, 3]` metres: the markers in the hand frame of the template that the joint network
-    was trained on, which is not the wearer's."""
-    dtype = markers.dtype
-    template = model.hand.template.astype(dtype, copy=False)
-    alignment = model.hand.alignment_weight.astype(dtype, copy=False)
-    weight = np.broadcast_to(alignment, markers.shape[:-1])
-    eye = np.broadcast_to(np.eye(3, dtype=dtype), (*markers.shape[:-2], 3, 3))
-    return untransform(*kabsch(template, markers, weight, eye), markers)
 
 
 def _notice(state: State, late: Array) -> Array:

@@ -20,7 +20,7 @@ from numpy_infer.cli import VERBS
 
 ROOT = Path(numpy_infer.__file__).resolve().parents[1]
 
-TWINS = ("geometry", "skeleton", "networks", "predictors", "tracker")
+TWINS = ("geometry", "skeleton", "networks", "predictors", "joints", "tracker")
 
 ONE_SIDED = {
     # What XLA must be told about small matrix products; numpy has `@`.
