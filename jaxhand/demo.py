@@ -263,9 +263,7 @@ def _draw(
     if find_spec("matplotlib") is None:
         console.print("no pictures without matplotlib: pip install 'jaxhand[plot]'")
         return
-    pictures.table3_picture(
-        {"table3": table}, config.out / "table3.png", overwrite=config.overwrite
-    )
+    pictures.table_picture(table, config.out / "table3.png", overwrite=config.overwrite)
     pictures.stream_picture(
         hand,
         streams.markers[0],

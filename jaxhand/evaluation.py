@@ -1,4 +1,4 @@
-"""How good a model is: Table 3 by the paper's protocol, the joint stage, intervals.
+"""How good the filled markers are: Table 3 by the paper's protocol, and its intervals.
 
 Table 3 (paper, section 6.2.1): everything is visible up to a frame, then k random markers are
 hidden for a duration; the error is the mean distance of the hidden markers to the truth on the last
@@ -22,9 +22,7 @@ import numpy as np
 
 from jaxhand import sequences as data
 from jaxhand import tracker
-from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
-from numpy_infer.hand import CHAINS
 from numpy_infer.model import Model
 from numpy_infer.pose import HandPose
 
@@ -47,11 +45,9 @@ RESAMPLINGS, FEWEST_BLOCKS = 1000, 10
 CHUNK = 4096
 """The most trials run at once. All chunks have one size, to compile once."""
 
-MEASURED_POINTS = np.array([point for chain in CHAINS for point in chain[1:]])
-"""`[15]` PIP, DIP and tip of the fingers; MCP, IP and tip of the thumb."""
-
 Cell = dict[str, Any]
 Report = Callable[[str, float], None]
+Errors = Callable[..., tuple[Array, Array]]
 
 
 class Starts(NamedTuple):
@@ -103,7 +99,7 @@ def table3(
     """
     starts = find_starts(sequences)
     return {
-        name: _table_of(model, starts, seeds, partial(report, name))
+        name: table_of(model, starts, seeds, partial(report, name))
         for name, model in models.items()
     }
 
@@ -167,44 +163,6 @@ def mean_ratio(table: Mapping[str, Any], method: str, rival: str) -> float:
     return float(np.mean(ratios))
 
 
-def joint_errors(model: Model, dataset: data.Dataset) -> dict[str, dict[str, Cell]]:
-    """The joint stage with nothing hidden, `{METHOD: {"cm", "deg", "wrist_mm", "wrist_deg"}}`.
-
-    `cm` is the mean distance of PIP, DIP and tip (thumb: MCP, IP, tip) to the truth, through the
-    whole pipeline, wrist pose and the model's own bone lengths included; `deg` the mean angle error
-    over the angles that the data determine. `learned` is the model, `mean_pose` the same with the
-    mean angles of its training data, whatever the markers say.
-
-    Raises:
-        ValueError: the model has no joint network, or the data no joint truth.
-    """
-    if model.joint_network is None:
-        raise ValueError("the model has no joint network")
-    frames = data.complete_frames(dataset)
-    if frames.angles is None or frames.positions is None or frames.rotations is None:
-        raise ValueError(f"data set {dataset.name!r} has no joint truth")
-    observed = dataset.observed_angles
-    observed = np.ones(frames.angles.shape[-1], bool) if observed is None else observed
-    poses = _poses(replace(model, predictor="affine", joints="learned"), frames.markers)
-    mean_angles = np.broadcast_to(model.joint_network.output_mean, frames.angles.shape)
-    mean_positions = _positions(model, mean_angles, poses.wrist_rotation, poses.wrist_position)
-    blocks = _frame_blocks(dataset, frames)
-    truth = frames.rotations[:, 0]
-    turn = np.einsum("nij,nij->n", poses.wrist_rotation, truth)
-    wrist = {
-        "wrist_mm": 1e3 * np.linalg.norm(poses.wrist_position - frames.positions[:, 0], axis=-1),
-        "wrist_deg": np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1))),
-    }
-    rows = {"learned": (poses.angles, poses.positions), "mean_pose": (mean_angles, mean_positions)}
-    result = {}
-    for name, (angles, positions) in rows.items():
-        distance = np.linalg.norm(positions - frames.positions, axis=-1)[:, MEASURED_POINTS]
-        turned = np.abs(np.degrees(angles - frames.angles))[:, observed]
-        values = {"cm": 1e2 * distance.mean(-1), "deg": turned.mean(-1), **wrist}
-        result[name] = {key: _interval_of(value, blocks) for key, value in values.items()}
-    return result
-
-
 def _runs(complete: Array) -> Array:
     """`[T]` length of the run of True that ends at each frame."""
     count = np.cumsum(complete)
@@ -212,35 +170,54 @@ def _runs(complete: Array) -> Array:
     return np.where(complete, count - broken, 0)
 
 
-def _table_of(
-    model: Model, starts: Starts, seeds: int, report: Callable[[float], None]
+def table_of(
+    model: Model,
+    starts: Starts,
+    seeds: int,
+    report: Callable[[float], None] = lambda share: None,
+    *,
+    errors: Errors | None = None,
+    counts: Sequence[int] = COUNTS,
+    durations: Sequence[float] = DURATIONS,
 ) -> dict[str, dict[str, Cell]]:
+    """One method's part of a table, `{COUNT: {DURATION: CELL}}`.
+
+    Args:
+        model: what runs until the gap begins.
+        starts: where to begin.
+        seeds: how many times every start is taken.
+        report: is told the share of the trials done.
+        errors: (state, starts, count, duration, generator) → error and block of each admissible
+            trial; by default that of Table 3.
+        counts, durations: the cells.
+    """
+    errors = partial(marker_errors, model) if errors is None else errors
     blocks = int(starts.block.max()) + 1
-    total = np.zeros((len(COUNTS), len(DURATIONS), blocks))
+    total = np.zeros((len(counts), len(durations), blocks))
     number = np.zeros(total.shape, int)
-    chunks, size = _chunks(len(starts.start))
+    chunks, size = chunked(len(starts.start))
     for done, first in enumerate(chunks):
         report(done / len(chunks))
         part = Starts(starts.frames, *(array[first : first + size] for array in starts[1:]))
         state = _visible_until(model, part, size)
-        for i, count in enumerate(COUNTS):
-            for j, duration in enumerate(DURATIONS):
+        for i, count in enumerate(counts):
+            for j, duration in enumerate(durations):
                 for seed in range(seeds):
                     rng = np.random.default_rng([seed, count, j, first])
-                    error, block = _errors(model, state, part, count, duration, rng)
+                    error, block = errors(state, part, count, duration, rng)
                     total[i, j] += np.bincount(block, error, blocks)
                     number[i, j] += np.bincount(block, minlength=blocks)
     report(1.0)
     return {
         str(count): {
             f"{duration:.1f}": interval(total[i, j], number[i, j])
-            for j, duration in enumerate(DURATIONS)
+            for j, duration in enumerate(durations)
         }
-        for i, count in enumerate(COUNTS)
+        for i, count in enumerate(counts)
     }
 
 
-def _chunks(count: int) -> tuple[range, int]:
+def chunked(count: int) -> tuple[range, int]:
     """Where the chunks of `count` trials begin, and their size."""
     size = -(-count // -(-count // CHUNK))
     return range(0, count, size), size
@@ -251,76 +228,58 @@ def _visible_until(model: Model, starts: Starts, size: int) -> Any:
     state = tracker.init(model, (size,))
     visible = jnp.ones((size, len(model.hand)), bool)
     for back in range(VISIBLE_BEFORE - 1, -1, -1):
-        markers = starts.frames[_padded(starts.start, size) - back]
+        markers = starts.frames[padded(starts.start, size) - back]
         state, _ = _step(model, state, markers, visible, jnp.full(size, 1 / data.RATE))
     return state
 
 
-def _errors(
-    model: Model, state: Any, starts: Starts, count: int, duration: float, rng: np.random.Generator
-) -> tuple[Array, Array]:
-    """Mean error of the hidden markers in cm, and the block, of each admissible trial."""
+class Trials(NamedTuple):
+    """The last hidden frame of trials `[n]`."""
+
+    hidden: Array
+    """`[n, M]` True at the markers that were hidden."""
+    last: Array
+    """`[n]` index of the frame among `Starts.frames`."""
+    pose: HandPose
+    """What the tracker made of it."""
+
+
+def run_trials(
+    model: Model, state: Any, starts: Starts, hidden: Array, duration: float
+) -> tuple[Trials, Array]:
+    """Hides `hidden [N, M]` for a duration from each start on. Gives the admissible trials, and
+    their bootstrap blocks `[n]`."""
     frames = round(data.RATE * duration)
-    hidden = hide(rng, len(starts.start), len(model.hand), count)
     admissible = starts.room >= frames
     last = starts.start + np.where(admissible, frames, 0)
     size = len(state.tracked)
-    truth = starts.frames[_padded(last, size)]
-    visible = ~_padded(hidden, size)
-    _, output = _step(model, state, truth, visible, jnp.full(size, duration))
-    distance = np.linalg.norm(np.asarray(output) - truth, axis=-1)[: len(hidden)]
-    error = 1e2 * (distance * hidden).sum(-1) / count
-    return error[admissible], starts.block[admissible]
+    truth = starts.frames[padded(last, size)]
+    visible = ~padded(hidden, size)
+    _, pose = _step(model, state, truth, visible, jnp.full(size, duration))
+    fields = (None if f is None else np.asarray(f)[: len(last)][admissible] for f in pose)
+    trials = Trials(hidden[admissible], last[admissible], HandPose(*fields))
+    return trials, starts.block[admissible]
 
 
-def _padded(values: Array, size: int) -> Array:
+def marker_errors(
+    model: Model, state: Any, starts: Starts, count: int, duration: float, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Mean error of the hidden markers in cm, and the block, of each admissible trial."""
+    hidden = hide(rng, len(starts.start), len(model.hand), count)
+    trials, block = run_trials(model, state, starts, hidden, duration)
+    distance = np.linalg.norm(trials.pose.markers - starts.frames[trials.last], axis=-1)
+    return 1e2 * (distance * trials.hidden).sum(-1) / count, block
+
+
+def padded(values: Array, size: int) -> Array:
     """`[n, ...]` → `[size, ...]`, the last one repeated."""
     return values[np.minimum(np.arange(size), len(values) - 1)]
 
 
 @jax.jit
-def _step(model: Model, state: Any, markers: Array, visible: Array, dt: Array) -> tuple[Any, Array]:
+def _step(
+    model: Model, state: Any, markers: Array, visible: Array, dt: Array
+) -> tuple[Any, HandPose]:
     # What is hidden does not get as far as the tracker, so no predictor can read it.
     markers = jnp.where(visible[..., None], markers, jnp.nan)
-    state, pose = tracker.step(model, state, markers, visible, dt)
-    return state, pose.markers
-
-
-def _poses(model: Model, markers: Array) -> Any:
-    """The tracker's output on complete frames `[N, M, 3]`, each as a first frame."""
-    chunks, size = _chunks(len(markers))
-    state = tracker.init(model, (size,))
-    visible, dt = jnp.ones((size, len(model.hand)), bool), jnp.zeros(size)
-    parts = []
-    for first in chunks:
-        part = markers[first : first + size]
-        pose = _pose(model, state, jnp.asarray(_padded(part, size), jnp.float32), visible, dt)
-        parts.append([np.asarray(array)[: len(part)] for array in pose])
-    return HandPose(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-
-
-@jax.jit
-def _pose(model: Model, state: Any, markers: Array, visible: Array, dt: Array) -> HandPose:
-    return tracker.step(model, state, markers, visible, dt)[1]
-
-
-@jax.jit
-def _positions(model: Model, angles: Array, rotation: Array, position: Array) -> Array:
-    local = rotations_from_angles(angles)
-    skeleton = jnp.asarray(model.hand.skeleton, angles.dtype)
-    return forward_kinematics(skeleton, local, rotation, position)[0]
-
-
-def _frame_blocks(dataset: data.Dataset, frames: data.CompleteFrames) -> Array:
-    """`[N]` bootstrap block of each complete frame."""
-    takes: dict[tuple[str, int], int] = {}
-    blocks = []
-    for number, index in zip(frames.sequence, frames.index, strict=True):
-        sequence = dataset.sequences[number]
-        key = (sequence.take, int(index / (sequence.rate * BLOCK_SECONDS)))
-        blocks.append(takes.setdefault(key, len(takes)))
-    return np.array(blocks)
-
-
-def _interval_of(values: Array, blocks: Array) -> Cell:
-    return interval(np.bincount(blocks, values), np.bincount(blocks))
+    return tracker.step(model, state, markers, visible, dt)

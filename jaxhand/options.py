@@ -20,3 +20,6 @@ Takes = Annotated[
 
 DataSets = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 """`--data NAME[:PATH][@WEIGHT]`, as often as wanted."""
+
+AlsoModels = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
+"""`--also NAME=FILE`, likewise."""

@@ -23,12 +23,23 @@ METHODS = {
     "affine": ("affine combination", "#e69f00", "D"),
     "learned": ("learned", "#0072b2", "o"),
     "learned_no_offset": ("learned, without continuity", "#56b4e9", "^"),
+    "ik": ("inverse kinematics", "#8c8c8c", "s"),
+    "ik_tuned": ("inverse kinematics, fine-tuned", "#e69f00", "D"),
+    "least_squares": ("least squares", "#cc79a7", "v"),
+    "learned_uncalibrated": ("learned, bones of others", "#56b4e9", "^"),
+    "learned_paper": ("learned, plain recipe", "#009e73", "P"),
 }
 """Name, colour and sign of each method. The colours stay apart for the colour-blind (Okabe & Ito
 2008), the signs in black and white."""
 
 TRUTH, OUTPUT, FILLED, BONE, GAP = "#1a1a1a", "#0072b2", "#d55e00", "#a9c7de", "#f6dfd0"
 """Colours of what is true, of the output, of its filled markers, of its bones and of gaps."""
+
+OTHER = "#000000", "x"
+"""Colour and sign of a method without its own."""
+
+UNHIDDEN = 0.05
+"""Where, on the axis of seconds, the error with nothing hidden is drawn."""
 
 BLIND = ("last_known", "moving_average")
 """Methods that do not look at the frame. Where the hand moves a lot they would press all other
@@ -50,20 +61,21 @@ PALM = (0, 1, 4, 7, 10, 13)
 """Its corners: indices into `hand.POINTS`."""
 
 
-def table3_picture(result: Mapping[str, Any], path: str | Path, *, overwrite: bool = False) -> None:
-    """Draws error against duration, a panel for each number of hidden markers (paper, Fig. 15a).
+def table_picture(table: Mapping[str, Any], path: str | Path, *, overwrite: bool = False) -> None:
+    """Draws error against duration, a panel for each number of hidden markers (paper, Fig. 15).
 
     Args:
-        result: `{"table3": {METHOD: {"1".."4": {"0.1".."2.0": CELL}}}}` as `jaxhand evaluate` gives
-            it; CELL is `mean`, `low`, `high` in cm, which may be None, and `n`.
+        table: Table 3 or 4, `{METHOD: {"1".."4": {"0.1".."2.0": CELL}}}` as `jaxhand evaluate`
+            gives it; CELL is `mean`, `low`, `high` in cm, which may be None, and `n`. Where a
+            method has a CELL at `"0"`, nothing hidden, all its curves begin there.
         path: the picture; its ending is the format.
         overwrite: replace the file if there is one.
 
     Raises:
         ValueError: the file exists, or matplotlib is missing.
     """
-    table = result["table3"]
     figure = _figure(path, overwrite, (12, 3.9))
+    table = {method: _from_unhidden(rows) for method, rows in table.items()}
     counts = list(next(iter(table.values())))
     panels = figure.subplots(1, len(counts), sharey=True, squeeze=False)[0]
     others = [rows for method, rows in table.items() if method not in BLIND]
@@ -78,6 +90,12 @@ def table3_picture(result: Mapping[str, Any], path: str | Path, *, overwrite: bo
     panels[0].set_ylabel("error on the last hidden frame (cm)")
     _legend(figure, panels)
     _save(figure, path)
+
+
+def _from_unhidden(rows: Mapping[str, Any]) -> dict[str, Any]:
+    """One method's part of a table, with what it has at `"0"` at the start of every curve."""
+    start = {} if "0" not in rows else {str(UNHIDDEN): rows["0"]}
+    return {count: start | row for count, row in rows.items() if count != "0"}
 
 
 def stream_picture(
@@ -175,7 +193,7 @@ def _largest(rows: Mapping[str, Any]) -> float:
 
 def _curve(panel: Any, method: str, row: Mapping[str, Any]) -> None:
     """One method's error over duration, with its interval."""
-    label, colour, sign = METHODS[method]
+    label, colour, sign = METHODS.get(method, (method, *OTHER))
     cells = {float(duration): c for duration, c in row.items() if c["mean"] is not None}
     means = [cell["mean"] for cell in cells.values()]
     panel.plot(list(cells), means, color=colour, marker=sign, markersize=4.5, label=label)
@@ -191,7 +209,9 @@ def _off_scale(panel: Any, table: Mapping[str, Any], count: str, top: float) -> 
         means = {float(d): c["mean"] for d, c in rows[count].items() if c["mean"] is not None}
         if means and max(means.values()) > top:
             duration = max(means, key=lambda d: means[d])
-            lines.append(f"{METHODS[method][0]}: {means[duration]:.0f} cm at {duration:g} s")
+            lines.append(
+                f"{METHODS.get(method, (method,))[0]}: {means[duration]:.0f} cm at {duration:g} s"
+            )
     if lines:
         text = "\n".join(["off scale", *lines])
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 1}
@@ -201,7 +221,8 @@ def _off_scale(panel: Any, table: Mapping[str, Any], count: str, top: float) -> 
 
 def _duration_axis(panel: Any, durations: list[str]) -> None:
     panel.set_xscale("log")
-    panel.set_xticks([float(d) for d in durations], [f"{float(d):g}" for d in durations])
+    labels = ["0" if float(d) == UNHIDDEN else f"{float(d):g}" for d in durations]
+    panel.set_xticks([float(d) for d in durations], labels)
     panel.minorticks_off()
     panel.set_xlabel("hidden for (s)")
     panel.grid(color="#e5e5e5", linewidth=0.6)

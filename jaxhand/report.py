@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from jaxhand import joint_evaluation
 from jaxhand.datasets import Dataset, load
-from jaxhand.evaluation import COUNTS, DURATIONS, SEEDS, joint_errors, mean_ratio, methods, table3
-from jaxhand.options import DataSets, Takes
+from jaxhand.evaluation import COUNTS, DURATIONS, SEEDS, Report, mean_ratio, methods, table3
+from jaxhand.joint_evaluation import joint_errors
+from jaxhand.options import AlsoModels, DataSets, Takes
 from numpy_infer.model import Model
 from numpy_infer.model import load as load_model
 from numpy_infer.predictors import PREDICTORS
@@ -31,6 +34,11 @@ class EvaluationConfig:
     """Data set NAME[:PATH]; its test split is taken. One a table."""
     model: str | None = None
     """A model file of `jaxhand train`, or the name of a baseline for the baselines alone."""
+    table: Literal[3, 4] = 3
+    """3: hidden markers, and the joints with nothing hidden; 4: the joints while markers are
+    hidden, beside inverse kinematics."""
+    also: AlsoModels = ()
+    """NAME=FILE: a further model's row in Table 4; as often as wanted."""
     test: Takes = ()
     """Takes to test on instead of the data set's default split."""
     json: Path | None = None
@@ -47,7 +55,9 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
     """Measures, prints, writes.
 
     Returns:
-        What `--json` holds: `{"table3": {METHOD: {"1".."4": {"0.1".."2.0": CELL}}},
+        What `--json` holds: with `--table 4` what `joint_evaluation` gives as `table4`, `wrist`,
+        `steadiness_mm` and `tip_distance_mm`; otherwise
+        `{"table3": {METHOD: {"1".."4": {"0.1".."2.0": CELL}}},
         "joints": {METHOD: {"cm", "deg", "wrist_mm", "wrist_deg": CELL}}}`, see `evaluation`.
 
     Raises:
@@ -72,6 +82,24 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
     for note in dataset.notes:
         console.print(f"[dim]{note}[/dim]")
     model = model or Model(dataset.hand, predictor=str(config.model))
+    if config.table == 4:
+        result = _joints_report(model, dataset, config, console)
+    else:
+        result = _markers_report(model, dataset, config, console)
+    if config.json is not None:
+        config.json.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
+        console.print(f"wrote {config.json}")
+    if config.plot is not None:
+        from jaxhand.pictures import table_picture
+
+        table_picture(result[f"table{config.table}"], config.plot, overwrite=config.overwrite)
+        console.print(f"wrote {config.plot}")
+    return result
+
+
+def _markers_report(
+    model: Model, dataset: Dataset, config: EvaluationConfig, console: Console
+) -> dict[str, Any]:
     result: dict[str, Any] = {
         "table3": _table3(model, dataset, config.seeds, console),
         "joints": {},
@@ -80,15 +108,68 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
     if model.joint_network is not None and dataset.sequences[0].angles is not None:
         result["joints"] = joint_errors(model, dataset)
         print_joints(result["joints"], console)
-    if config.json is not None:
-        config.json.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
-        console.print(f"wrote {config.json}")
-    if config.plot is not None:
-        from jaxhand.pictures import table3_picture
-
-        table3_picture(result, config.plot, overwrite=config.overwrite)
-        console.print(f"wrote {config.plot}")
     return result
+
+
+def _joints_report(
+    model: Model, dataset: Dataset, config: EvaluationConfig, console: Console
+) -> dict[str, Any]:
+    if model.marker_network is None or model.joint_network is None:
+        raise ValueError("Table 4 needs a model with both networks")
+    others = {name: load_model(path) for name, path in map(_named, config.also)}
+    rows = joint_evaluation.rows(model, dataset, others)
+    with _bars(list(rows), console) as report:
+        table = joint_evaluation.table4(rows, dataset, seeds=config.seeds, report=report)
+    own = rows["learned"].model
+    result: dict[str, Any] = {
+        "table4": table,
+        "wrist": joint_evaluation.wrist_errors(own, dataset, config.seeds),
+        "steadiness_mm": joint_evaluation.steadiness(own, dataset),
+        "tip_distance_mm": joint_evaluation.tip_distance_errors(own, dataset),
+    }
+    print_table4(table, console)
+    for count, cells in result["wrist"].items():
+        console.print(
+            f"wrist, {count} alignment markers hidden for 0.5 s: {_cell(cells['mm'])} mm, "
+            f"{_cell(cells['deg'])}°"
+        )
+    steadiness = result["steadiness_mm"]
+    console.print(
+        f"third difference of the joints: {steadiness['jitter']:.3f} mm, of the truth "
+        f"{steadiness['jitter_of_truth']:.3f} mm; steps of a still hand with markers that are "
+        f"{1e3 * joint_evaluation.STILL_NOISE:g} mm noisy: {steadiness['still']:.2f} mm"
+    )
+    console.print(
+        f"distance of thumb tip and finger tips under 3 cm: off by "
+        f"{_cell(result['tip_distance_mm'])} mm"
+    )
+    return result
+
+
+def _named(text: str) -> tuple[str, str]:
+    name, _, path = text.partition("=")
+    if not name or not path:
+        raise ValueError(f"also: expected NAME=FILE, found {text!r}")
+    return name, path
+
+
+def print_table4(table: Mapping[str, Any], console: Console) -> None:
+    """Table 4: error in cm, with half of its 95 % interval."""
+    printed = Table(
+        title="Error of the joints with k markers hidden, cm (paper, Table 4)",
+        box=SIMPLE_HEAD,
+        padding=0,
+        show_edge=False,
+    )
+    for heading in ("method", "k", *(f"{duration:g} s" for duration in DURATIONS)):
+        justify: Any = "left" if heading == "method" else "right"
+        printed.add_column(heading, justify=justify, no_wrap=True)
+    for name, rows in table.items():
+        printed.add_row(name, "0", _cell(rows["0"]))
+        for count in COUNTS:
+            cells = [_cell(rows[str(count)][f"{duration:.1f}"]) for duration in DURATIONS]
+            printed.add_row("", str(count), *cells, end_section=count == COUNTS[-1])
+    console.print(printed)
 
 
 def print_table3(table: Mapping[str, Any], console: Console) -> None:
@@ -131,15 +212,22 @@ def _table3(
     model: Model, dataset: Dataset, seeds: int, console: Console
 ) -> dict[str, dict[str, dict[str, Any]]]:
     rows = methods(replace(model, joints="none"))
-    columns = (TextColumn("{task.description:18}"), BarColumn(), TimeElapsedColumn())
+    with _bars(list(rows), console) as report:
+        return table3(rows, dataset.sequences, seeds=seeds, report=report)
+
+
+@contextmanager
+def _bars(names: list[str], console: Console) -> Iterator[Report]:
+    """A line with a bar for each method."""
+    columns = (TextColumn("{task.description:20}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as progress:
-        bars = {name: progress.add_task(name, total=1.0, start=False) for name in rows}
+        bars = {name: progress.add_task(name, total=1.0, start=False) for name in names}
 
         def report(name: str, share: float) -> None:
             progress.start_task(bars[name])
             progress.update(bars[name], completed=share)
 
-        return table3(rows, dataset.sequences, seeds=seeds, report=report)
+        yield report
 
 
 def _cell(cell: Mapping[str, Any]) -> str:

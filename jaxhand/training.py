@@ -29,6 +29,7 @@ from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
 from jaxhand.options import DataSets, Takes
 from jaxhand.sequences import Dataset, complete_frames
+from jaxhand.sparse_fit import prior_of
 from jaxhand.tasks import Augmentation, Frames, Task, joint_task, marker_task, mean_square
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, Hand, load_hand
@@ -341,6 +342,11 @@ def fit_networks(
     if not networks:
         raise KeyboardInterrupt
     joints = "learned" if "joint_network" in networks else "none"
+    if joints == "learned":
+        known = training.angles[np.isfinite(training.angles).all(-1)]  # type: ignore[index, arg-type]
+        # What the rival that fits postures knows of them, see `sparse_fit`.
+        posture = prior_of(np.asarray(known))._asdict()
+        summary["posture"] = {name: array.tolist() for name, array in posture.items()}
     return Model(hand, predictor="learned", joints=joints, training=summary, **networks)
 
 

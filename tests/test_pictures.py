@@ -31,13 +31,11 @@ def table(**means: float) -> dict[str, Any]:
         return {"mean": mean, "low": low, "high": high, "n": 100}
 
     return {
-        "table3": {
-            method: {
-                count: {d: cell(mean * (i + 1), d == "2.0") for i, d in enumerate(DURATIONS)}
-                for count in "1234"
-            }
-            for method, mean in means.items()
+        method: {
+            count: {d: cell(mean * (i + 1), d == "2.0") for i, d in enumerate(DURATIONS)}
+            for count in "1234"
         }
+        for method, mean in means.items()
     }
 
 
@@ -61,7 +59,7 @@ def is_png(path: Path) -> bool:
 
 
 def test_table_3_is_drawn(tmp_path: Path) -> None:
-    pictures.table3_picture(
+    pictures.table_picture(
         table(affine=1.0, learned=0.5, last_known=2.0, moving_average=30.0), tmp_path / "t.png"
     )
     assert is_png(tmp_path / "t.png")
@@ -69,16 +67,16 @@ def test_table_3_is_drawn(tmp_path: Path) -> None:
 
 def test_a_baseline_alone_and_missing_cells_are_drawn(tmp_path: Path) -> None:
     alone = table(moving_average=30.0)
-    pictures.table3_picture(alone, tmp_path / "alone.png")
+    pictures.table_picture(alone, tmp_path / "alone.png")
     assert is_png(tmp_path / "alone.png")
     holes = table(affine=1.0)
-    holes["table3"]["affine"]["4"]["2.0"] = {"mean": None, "low": None, "high": None, "n": 0}
-    pictures.table3_picture(holes, tmp_path / "holes.png")
+    holes["affine"]["4"]["2.0"] = {"mean": None, "low": None, "high": None, "n": 0}
+    pictures.table_picture(holes, tmp_path / "holes.png")
     assert is_png(tmp_path / "holes.png")
 
 
 def test_what_is_off_the_scale_is_said(tmp_path: Path) -> None:
-    pictures.table3_picture(table(affine=1.0, moving_average=30.0), tmp_path / "t.svg")
+    pictures.table_picture(table(affine=1.0, moving_average=30.0), tmp_path / "t.svg")
     text = (tmp_path / "t.svg").read_text("utf-8")
     assert "off scale" in text
     assert "hidden for (s)" in text
@@ -104,7 +102,7 @@ def test_nothing_is_replaced_unasked(tmp_path: Path, which: str) -> None:
 
     def draw(**options: Any) -> None:
         if which == "table3":
-            pictures.table3_picture(table(affine=1.0), path, **options)
+            pictures.table_picture(table(affine=1.0), path, **options)
         else:
             pictures.stream_picture(**stream(), path=path, **options)
 
@@ -115,10 +113,25 @@ def test_nothing_is_replaced_unasked(tmp_path: Path, which: str) -> None:
     assert is_png(path)
 
 
+def test_curves_of_table_4_begin_at_nothing_hidden(tmp_path: Path) -> None:
+    joints = table(learned=1.0, ik=2.0, of_mine=3.0)
+    for rows in joints.values():
+        rows["0"] = {"mean": 0.5, "low": 0.4, "high": 0.6, "n": 9}
+    pictures.table_picture(joints, tmp_path / "t4.svg")
+    text = (tmp_path / "t4.svg").read_text("utf-8")
+    assert "0 marker" not in text
+    assert is_png_of(joints, tmp_path / "t4.png")
+
+
+def is_png_of(rows: dict[str, Any], path: Path) -> bool:
+    pictures.table_picture(rows, path)
+    return is_png(path)
+
+
 def test_pyplot_is_left_alone(tmp_path: Path) -> None:
     code = (
         "import sys; from tests.test_pictures import *; "
-        f"pictures.table3_picture(table(affine=1.0), {str(tmp_path / 'p.png')!r}); "
+        f"pictures.table_picture(table(affine=1.0), {str(tmp_path / 'p.png')!r}); "
         "assert 'matplotlib.figure' in sys.modules; sys.exit('matplotlib.pyplot' in sys.modules)"
     )
     root = Path(__file__).resolve().parents[1]
@@ -130,4 +143,4 @@ def test_without_matplotlib_it_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ValueError, match=r"pip install 'jaxhand\[plot\]'"):
-        pictures.table3_picture(table(affine=1.0), tmp_path / "p.png")
+        pictures.table_picture(table(affine=1.0), tmp_path / "p.png")
