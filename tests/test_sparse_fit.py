@@ -17,6 +17,7 @@ from conftest import x64
 from jaxhand import datasets, sparse_fit
 from jaxhand.ik import Solved, ccd
 from jaxhand.sparse_fit import PosePrior, least_squares, prior_of
+from jaxhand.tasks import JOINT_POINTS
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, Hand, load_hand
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
