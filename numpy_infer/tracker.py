@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from numpy_infer import wearer
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import (
     kabsch,
@@ -458,13 +459,23 @@ class HandTracker:
         self._state = init(model, self._right.shape, self._right)
 
     @classmethod
-    def load(cls, path: str | Path, *, right: bool | Sequence[bool] = False) -> HandTracker:
-        """A tracker that runs a model file.
+    def load(
+        cls,
+        path: str | Path,
+        *,
+        calibration: str | Path | None = None,
+        right: bool | Sequence[bool] = False,
+    ) -> HandTracker:
+        """A tracker that runs a model file, for whoever a calibration file describes.
 
         Raises:
-            ValueError: the file is not a model, or a damaged one; see `model.load`.
+            ValueError: a file is not what it should be, or damaged; see `model.load` and
+                `wearer.load`.
         """
-        return cls(load(path), right=right)
+        model = load(path)
+        if calibration is not None:
+            model = wearer.calibrated(model, wearer.load(calibration))
+        return cls(model, right=right)
 
     @property
     def hand(self) -> Hand:

@@ -1,0 +1,104 @@
+"""A calibration file: the bones of whoever wears the glove, where its markers sit, a flat pose."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from numpy_infer.arrays import Array
+from numpy_infer.hand import ANGLES, FINGERS, Hand, hand_from_json
+from numpy_infer.model import Model
+from numpy_infer.skeleton import rotations_from_angles
+
+FORMAT, VERSION = "jaxhand-calibration", 1
+
+
+@dataclass(frozen=True, eq=False)
+class Wearer:
+    """What a calibration found out about a person in a glove."""
+
+    hand: Hand
+    """The glove's markers on the person's bones and at their places."""
+    flat: Array | None = None
+    """`[26]` radians that the joint network gives while the person holds a flat hand, or None."""
+    unseen: tuple[str, ...] = ()
+    """Fingers that moved too little to say anything of their bones."""
+
+
+def save(wearer: Wearer, path: str | Path, *, overwrite: bool = False) -> None:
+    """Writes a calibration as JSON.
+
+    Raises:
+        ValueError: the file exists and `overwrite` is False.
+    """
+    path = Path(path)
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists; pass overwrite=True to replace it")
+    flat = None
+    if wearer.flat is not None:
+        flat = {a.name: float(v) for a, v in zip(ANGLES, wearer.flat, strict=True)}
+    data = {
+        "format": FORMAT,
+        "version": VERSION,
+        "hand": wearer.hand.to_json(),
+        "flat": flat,
+        "unseen": list(wearer.unseen),
+    }
+    part = path.with_name(path.name + ".part")
+    part.write_text(json.dumps(data, indent=1) + "\n", "utf-8")
+    part.replace(path)
+
+
+def load(path: str | Path) -> Wearer:
+    """Reads a calibration, with every check.
+
+    Raises:
+        ValueError: no such file, or one that is damaged; the message says where.
+    """
+    try:
+        return _read(json.loads(Path(path).read_text("utf-8")))
+    except FileNotFoundError:
+        raise ValueError(f"no calibration file {path}") from None
+    except (ValueError, RecursionError) as error:  # no UTF-8, no JSON, too deep, no calibration
+        raise ValueError(f"{path}: {error}") from None
+
+
+def _read(data: Any) -> Wearer:
+    expected = {"format", "version", "hand", "flat", "unseen"}
+    if not isinstance(data, dict) or set(data) != expected:
+        raise ValueError(f"expected an object with {', '.join(sorted(expected))}")
+    if data["format"] != FORMAT or data["version"] != VERSION:
+        raise ValueError(
+            f"expected format {FORMAT!r} version {VERSION}, found {data['format']!r} version "
+            f"{data['version']!r}"
+        )
+    flat = data["flat"]
+    if flat is not None:
+        names = [angle.name for angle in ANGLES]
+        if not isinstance(flat, dict) or list(flat) != names:
+            raise ValueError(
+                f"'flat': expected the {len(names)} angles in the order of hand.ANGLES"
+            )
+        if not all(type(v) in (int, float) and abs(v) < 10 for v in flat.values()):
+            raise ValueError(f"'flat': expected radians, found {list(flat.values())}")
+        flat = np.array(list(flat.values()), np.float64)
+    unseen = data["unseen"]
+    if not isinstance(unseen, list) or any(finger not in FINGERS for finger in unseen):
+        raise ValueError(
+            f"'unseen': expected fingers out of {', '.join(FINGERS)}, found {unseen!r}"
+        )
+    return Wearer(hand_from_json(data["hand"]), flat, tuple(unseen))
+
+
+def calibrated(model: Model, wearer: Wearer) -> Model:
+    """The model as it runs for this person: joints and wrist pose on the person's bones.
+
+    Raises:
+        ValueError: the calibration is of another glove.
+    """
+    flat = None if wearer.flat is None else rotations_from_angles(wearer.flat)
+    return replace(model, wearer=wearer.hand, flat=flat)
