@@ -20,6 +20,7 @@ from jaxhand.geometry import product
 from jaxhand.simulation import BONE_SPREAD, DIP_SHARE, PERSON_SPREAD
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
+from numpy_infer.geometry import rotation_from_vector
 from numpy_infer.hand import ANGLES, CHAINS, FINGERS, POINTS, Hand
 
 CHUNK = 240
@@ -79,7 +80,8 @@ _BASES = np.array(CHAINS)[:, 0]
 _BONES = np.array([i for i in range(1, len(POINTS)) if i not in _BASES])
 WIDTHS = np.array([1, len(_BONES), 3 * len(_BASES)])
 """How many unknowns of a skeleton are the hand's size, bones' lengths, places of fingers' bases."""
-_LOW, _HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
+LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
+"""`[26]` radians each: the ends of the angles' ranges."""
 
 
 class Priors(NamedTuple):
@@ -227,14 +229,11 @@ def moved(problem: Problem, state: State, frames: Array, shared: Array) -> State
     step = np.zeros(len(problem.free))
     step[problem.free] = shared
     bones, offsets = np.split(step, [len(state.bones)])
-    half = cross_matrix(frames[:, TURN] / 2)
-    # Cayley's map: a rotation for every step, and the step itself where it is small.
-    turn = np.linalg.solve(np.eye(3) - half, np.eye(3) + half)
     return State(
         state.bones + bones,
         state.offsets + offsets.reshape(-1, 3),
         state.angles + frames[:, _JOINTS],
-        turn @ state.rotation,
+        rotation_from_vector(frames[:, TURN]) @ state.rotation,
         state.position + frames[:, SHIFT],
     )
 
@@ -341,8 +340,8 @@ def _process(problem: Problem, state: State) -> tuple[float, Array, Array, Array
 
 def _trespass(angles: Array) -> tuple[Array, Array]:
     """`[T, 26]` how far an angle is out of its range, softly, in `RANGE_PRIOR`; its derivative."""
-    above = angles - _HIGH > _LOW - angles
-    far = np.where(above, angles - _HIGH, _LOW - angles) / RANGE_PRIOR
+    above = angles - HIGH > LOW - angles
+    far = np.where(above, angles - HIGH, LOW - angles) / RANGE_PRIOR
     share = np.exp(-np.logaddexp(0, -far))
     return np.logaddexp(0, far), np.where(above, share, -share) / RANGE_PRIOR
 

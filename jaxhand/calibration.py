@@ -21,6 +21,7 @@ from numpy_infer import geometry
 from numpy_infer import skeleton as runtime
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, CHAINS, FINGERS, Hand
+from numpy_infer.tracker import DETERMINED_EXTENT
 
 __all__ = ["Calibration", "Priors", "Unknowns", "calibrate", "new_hand"]
 
@@ -45,8 +46,6 @@ all others are known."""
 FLEXIONS, MOVED = (0, 3), np.radians(20)
 """A finger is seen once two of its angles, the flexions of its first and second joint, have both
 gone through this much."""
-SPREAD = 5e-3
-"""Metres: accepted markers whose second singular value is less do not determine the wrist."""
 NEAR = 1e-2, 4e-2
 """Metres: how far markers are off before they count for less in the first registration, and no
 longer count in the first choice of a posture."""
@@ -215,7 +214,7 @@ def _posed(problem: Problem) -> State:
     few, as in the nearest frame where they are not."""
     hand, markers = problem.hand, np.nan_to_num(problem.markers)
     weight = np.isfinite(problem.markers[..., 0]) * hand.alignment_weight.astype(np.float64)
-    good = geometry.second_extent(markers, weight) > SPREAD
+    good = geometry.second_extent(markers, weight) > DETERMINED_EXTENT
     if not good.any():
         raise ValueError("markers: no frame with three alignment markers that are not in line")
     bones, aligned = np.zeros(arrow.WIDTHS.sum()), list(hand.alignment)
@@ -342,7 +341,8 @@ def _report(
     every = np.zeros((len(problem.free),) * 2)
     every[np.ix_(problem.free, problem.free)] = shared
     measured, flat = np.isfinite(problem.markers[..., 0]), np.float32(hand.skeleton)
-    tracked = geometry.second_extent(np.nan_to_num(problem.markers), accepted * 1.0) > SPREAD
+    extent = geometry.second_extent(np.nan_to_num(problem.markers), accepted * 1.0)
+    tracked = extent > DETERMINED_EXTENT
 
     skeleton = np.asarray(arrow.skeleton(flat, np.float32(bones)), np.float64)
     by_bones = np.asarray(jax.jacfwd(arrow.skeleton, 1)(flat, np.float32(bones)), np.float64)

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from typing import TypeVar
+
+Config = TypeVar("Config")
 
 
 def train(arguments: list[str]) -> int:
     """`jaxhand train`."""
-    import tyro
-
     from jaxhand import training
 
     description = (
         "Trains the marker network and the joint network and writes one model file.\n\n"
         "Example: jaxhand train --data manipnet:data/manipnet --out runs/manipnet"
     )
-    config = tyro.cli(
-        training.TrainingConfig, args=arguments, prog="jaxhand train", description=description
-    )
+    config = _parsed(training.TrainingConfig, arguments, "jaxhand train", description)
     try:
         training.train(config)
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         print(f"jaxhand train: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
@@ -31,8 +31,6 @@ def train(arguments: list[str]) -> int:
 
 def evaluate(arguments: list[str]) -> int:
     """`jaxhand evaluate`."""
-    import tyro
-
     from jaxhand import report
 
     description = (
@@ -40,21 +38,12 @@ def evaluate(arguments: list[str]) -> int:
         "paper's Table 3, and the joints with nothing hidden.\n\n"
         "Example: jaxhand evaluate --model runs/manipnet/model.npz --data manipnet:data/manipnet"
     )
-    config = tyro.cli(
-        report.EvaluationConfig, args=arguments, prog="jaxhand evaluate", description=description
-    )
-    try:
-        report.evaluate(config)
-    except ValueError as error:
-        print(f"jaxhand evaluate: {error}", file=sys.stderr)
-        return 2
-    return 0
+    config = _parsed(report.EvaluationConfig, arguments, "jaxhand evaluate", description)
+    return _told("evaluate", lambda: report.evaluate(config))
 
 
 def demo(arguments: list[str]) -> int:
     """`jaxhand demo`."""
-    import tyro
-
     from jaxhand import demo
 
     description = (
@@ -62,10 +51,53 @@ def demo(arguments: list[str]) -> int:
         "networks, measures them, exports the model and runs it with numpy alone.\n\n"
         "Example: jaxhand demo --out demo"
     )
-    config = tyro.cli(demo.DemoConfig, args=arguments, prog="jaxhand demo", description=description)
+    config = _parsed(demo.DemoConfig, arguments, "jaxhand demo", description)
+    return _told("demo", lambda: demo.demo(config))
+
+
+def calibrate(arguments: list[str]) -> int:
+    """`jaxhand calibrate`."""
+    from jaxhand import glove
+
+    description = (
+        "Finds out how large the hand in the glove is, from 5 to 30 s in which every finger is "
+        "bent and stretched. The tracker then makes joints and wrist on that hand's own bones.\n\n"
+        "Example: jaxhand calibrate free.trc --model model.npz -o me.json"
+    )
+    config = _parsed(glove.CalibrateConfig, arguments, "jaxhand calibrate", description)
+    return _told("calibrate", lambda: glove.calibrate_person(config))
+
+
+def hand(arguments: list[str]) -> int:
+    """`jaxhand hand`."""
+    from jaxhand import glove
+
+    description = (
+        "Writes a hand file for a new glove, from some ten seconds of flat and free motion: where "
+        "its markers sit, on which bones.\n\n"
+        "Example: jaxhand hand free.trc --like glove9 -o my_glove.json"
+    )
+    config = _parsed(glove.HandConfig, arguments, "jaxhand hand", description)
+    return _told("hand", lambda: glove.describe_glove(config))
+
+
+def _parsed(config: type[Config], arguments: list[str], prog: str, description: str) -> Config:
+    import tyro
+
+    return tyro.cli(
+        config,
+        args=arguments,
+        prog=prog,
+        description=description,
+        config=(tyro.conf.FlagCreatePairsOff,),
+    )
+
+
+def _told(verb: str, run: Callable[[], object]) -> int:
+    """Runs a verb; what is wrong is one line on stderr and exit code 2."""
     try:
-        demo.demo(config)
-    except ValueError as error:
-        print(f"jaxhand demo: {error}", file=sys.stderr)
+        run()
+    except (ValueError, OSError) as error:
+        print(f"jaxhand {verb}: {error}", file=sys.stderr)
         return 2
     return 0

@@ -19,16 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxhand.networks  # noqa: F401  makes `Hand` an argument that jit understands
-from jaxhand.geometry import cross, kabsch, product, second_extent, transform, untransform
-from jaxhand.skeleton import (
-    angles_from_rotations,
-    forward_kinematics,
-    marker_positions,
-    rotations_from_angles,
-)
+from jaxhand.arrow import FINGER, SLOT
+from jaxhand.geometry import kabsch, product, second_extent, transform, untransform
+from jaxhand.ik import in_hand_frame
+from jaxhand.skeleton import align_fingers, angles_from_rotations, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import kabsch as numpy_kabsch
-from numpy_infer.geometry import mirror, mirror_rotation, nearest_rotation
+from numpy_infer.geometry import mirror, mirror_rotation, nearest_rotation, shortest_arc
 from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, PARENTS, Hand, flat_points
 from numpy_infer.recordings import Recording
 from numpy_infer.tracker import DETERMINED_EXTENT
@@ -52,9 +49,6 @@ that comes back (section 3.2.2), for the tip of a straight finger."""
 POSE_SHARE, POSE_NOISE = 0.1, 6e-3
 """Where the alignment markers do not determine the pose: the weight of a finger's marker in it,
 beside 1 of theirs, and `MARKER_NOISE` then."""
-CUT_SHARE, CUT = 0.1, 1e-5
-"""Where |a||b| + a·b is less than this part of |a||b| (beyond 154 degrees) and these m² (shorter
-than about a millimetre) the shortest arc is cut short."""
 
 AUTHORS_JOINTS = {
     f"l_{finger}{i + 1}": JOINTS[chain[i]]
@@ -63,11 +57,10 @@ AUTHORS_JOINTS = {
 }
 """The joints of the paper authors' files → ours."""
 
-_OF_FINGER = [[i for i, a in enumerate(ANGLES) if a.joint.startswith(f)] for f in FINGERS]
-_WIDTH = max(map(len, _OF_FINGER))
-_ANGLE = np.array([(own + [len(ANGLES)] * _WIDTH)[:_WIDTH] for own in _OF_FINGER])
+_WIDTH = int(SLOT.max()) + 1
+_ANGLE = np.full((len(FINGERS), _WIDTH), len(ANGLES))
+_ANGLE[FINGER, SLOT] = np.arange(len(ANGLES))
 """`[5, 6]` the angle at each finger's slot; 26 stands for a slot that the finger does not use."""
-_FINGER, _SLOT = np.array([np.argwhere(i == _ANGLE)[0] for i in range(len(ANGLES))]).T
 _BASES = np.array(CHAINS)[:, 0]
 _PARENTS = np.array(PARENTS)[1 : len(JOINTS)]
 
@@ -124,26 +117,11 @@ def fuse(hand: Hand, imu_rotations: Array, markers: Array, dt: Array | float) ->
 
 
 def paper_fuse(hand: Hand, imu_rotations: Array, markers: Array, dt: Array | float) -> Fused:
-    """The paper's plain route, to compare `fuse` with: each finger is turned about its base by the
-    shortest arc from where the glove has its last marker to where that is measured. While it, or
-    the pose, is not seen, the turn is held; before, it is the first one. Errors of flexion stay in
-    the finger's shape. (The paper aims the middle of the last phalanx, presuming the marker there.)
-    Arguments as of `fuse`."""
+    """The paper's plain route, to compare `fuse` with: each finger of the glove is turned about its
+    base by `align_fingers`. While its outermost marker, or the pose, is not seen, the turn is held;
+    before, it is the first one. Errors of flexion stay in the finger's shape. Arguments as of
+    `fuse`."""
     return _run(_paper_fuse, hand, imu_rotations, markers, dt)
-
-
-def shortest_arc(a: Array, b: Array) -> Array:
-    """`[..., 3, 3]` the smallest rotation of `a [..., 3]` onto the direction of `b [..., 3]`, both
-    metres. No map can be that everywhere and continuous: as the two become antiparallel or vanish
-    it goes over into the identity, see `CUT`."""
-    size = jnp.sqrt((a * a).sum(-1) * (b * b).sum(-1))
-    w, cut, axis = size + (a * b).sum(-1), CUT_SHARE * size + CUT, cross(a, b)
-    w = w + cut * jnp.maximum(0, 1 - w / cut) ** 2
-    # The unit quaternion (axis, w) as a matrix: I + 2 w [axis]ₓ + 2 [axis]ₓ².
-    norm = jnp.sqrt(w * w + (axis * axis).sum(-1))[..., None]
-    eye = jnp.eye(3, dtype=a.dtype)
-    matrix = cross(eye, (axis / norm)[..., None, :])
-    return eye + 2 * (w[..., None] / norm)[..., None] * matrix + 2 * product(matrix, matrix)
 
 
 def kalman_update(
@@ -217,8 +195,8 @@ def imu_from_recording(
                 bone = (points[chosen, joint + 1] - points[chosen, joint])[:, None]
                 along = (bone @ turns[chosen, joint]).mean((0, 1))
             straight = hand.skeleton[PARENTS.index(joint)]
-            arc = shortest_arc(*map(np.float32, (ours[joint] @ along, straight)))
-            ours[joint] = np.asarray(arc) @ ours[joint]
+            arc = shortest_arc(ours[joint] @ along, straight, np.ones(()))
+            ours[joint] = arc @ ours[joint]
     rotations: Array = ours[_PARENTS] @ local @ np.swapaxes(ours[1:], -1, -2)
     return rotations.astype(np.float32)
 
@@ -304,8 +282,8 @@ def _fuse(hand: Hand, imu: Array, markers: Array, seen: Array, dt: Array) -> Fus
         felt, rest, markers, seen, dt, slew, determined, rotation, position = now
 
         def modelled(correction: Array) -> Array:
-            angles = felt + correction[_FINGER, _SLOT]
-            return _placed(hand, product(rotations_from_angles(angles), rest))
+            angles = felt + correction[FINGER, SLOT]
+            return in_hand_frame(hand, product(rotations_from_angles(angles), rest))[0]
 
         def helped_out() -> tuple[Array, Array]:
             points = modelled(state.output).at[own].set(hand.template[own])
@@ -344,7 +322,7 @@ def _fuse(hand: Hand, imu: Array, markers: Array, seen: Array, dt: Array) -> Fus
     slew = (SLEW * dt).at[0].set(jnp.inf)
     frames = (felt, rest, markers, seen, dt, slew, determined, rotations, positions)
     _, (correction, rotation, position) = jax.lax.scan(frame, start, frames)
-    angles = felt + correction[:, _FINGER, _SLOT]
+    angles = felt + correction[:, FINGER, SLOT]
     fused = product(rotations_from_angles(angles), rest)
     return _result(hand, fused, rotation, position, markers, seen)
 
@@ -363,13 +341,14 @@ def _predict(mean: Array, covariance: Array, seen: Array, dt: Array) -> tuple[Ar
 def _paper_fuse(hand: Hand, imu: Array, markers: Array, seen: Array, _: Array) -> Fused:
     determined, rotation, position = _poses(hand, markers, seen)
     rotation, position = _held(rotation, determined), _held(position, determined)
-    base = hand.skeleton[_BASES]
-    modelled = _by_finger(hand, _placed(hand, imu))[:, :, -1] - base
-    measured = _by_finger(hand, untransform(rotation, position, markers))[:, :, -1] - base
-    aimed = _by_finger(hand, seen[..., None])[:, :, -1, 0] & determined[:, None]
-    arc = shortest_arc(modelled, measured)
-    arc = jax.vmap(_held, 1, 1)(jnp.where(aimed[..., None, None], arc, jnp.eye(3)), aimed)
-    fused = imu.at[:, ::3].set(product(arc, imu[:, ::3]))
+    measured = untransform(rotation, position, markers)
+    aimed = seen & determined[:, None]
+    _, points, links = in_hand_frame(hand, imu)
+    aligned = align_fingers(hand, imu, points, links, measured, aimed.astype(imu.dtype))
+    # Apart from what the glove felt then, the turn can be held.
+    turn = product(aligned[:, ::3], jnp.swapaxes(imu[:, ::3], -1, -2))
+    turn = jax.vmap(_held, 1, 1)(turn, _by_finger(hand, aimed[..., None])[:, :, -1, 0])
+    fused = imu.at[:, ::3].set(product(turn, imu[:, ::3]))
     return _result(hand, fused, rotation, position, markers, seen)
 
 
@@ -387,21 +366,11 @@ def _poses(hand: Hand, markers: Array, seen: Array) -> tuple[Array, Array, Array
     return second_extent(markers, weight) > DETERMINED_EXTENT, rotation, position
 
 
-def _placed(hand: Hand, rotations: Array) -> Array:
-    """`[..., M, 3]` metres, hand frame: the markers at parent_from_joint `[..., 15, 3, 3]`."""
-    still = (jnp.eye(3), jnp.zeros(3))
-    return marker_positions(hand, *forward_kinematics(hand.skeleton, rotations, *still))
-
-
 def _by_finger(hand: Hand, of_markers: Array) -> Array:
     """`[..., M, N]` → `[..., 5, K, N]`: the markers that each finger carries, from base to tip; in
     front of them zeros where they are fewer than K."""
-    table: list[list[int]] = [[] for _ in FINGERS]
-    for marker in sorted(range(len(hand)), key=lambda m: (hand.links[m], hand.joints[m])):
-        if hand.links[marker] > 0:
-            table[(hand.links[marker] - 1) // 3].append(marker)
-    width = max(1, *map(len, table))
-    rows = np.array([[len(hand)] * (width - len(own)) + own for own in table])
+    width = max(1, *map(len, hand.finger_markers))
+    rows = np.array([(*[len(hand)] * (width - len(own)), *own) for own in hand.finger_markers])
     none = jnp.zeros_like(of_markers[..., :1, :])
     return jnp.concatenate([of_markers, none], -2)[..., rows, :]
 
@@ -409,7 +378,7 @@ def _by_finger(hand: Hand, of_markers: Array) -> Array:
 def _result(
     hand: Hand, fused: Array, rotation: Array, position: Array, markers: Array, seen: Array
 ) -> Fused:
-    off = transform(rotation, position, _placed(hand, fused)) - markers
+    off = transform(rotation, position, in_hand_frame(hand, fused)[0]) - markers
     square = jnp.where(seen, (off * off).sum(-1), 0)
     both = jnp.stack([square, seen.astype(square.dtype)], -1)
     total, count = jnp.moveaxis(_by_finger(hand, both).sum(-2), -1, 0)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhand.geometry import cross, inner, kabsch, product, untransform
+from jaxhand.geometry import cross, inner, kabsch, product, rotation_from_vector, untransform
 from jaxhand.skeleton import (
     angles_from_rotations,
     forward_kinematics,
@@ -154,9 +154,9 @@ _LOW, _HIGH = _limits()
 def _pulling(hand: Hand) -> tuple[Array, Array]:
     """The markers of each finger `[5, K]`, and `[3, 5, K]` 1 for those that its first, second and
     third joint carry."""
-    own = [[m for m, link in enumerate(hand.links) if (link + 2) // 3 == 1 + f] for f in range(5)]
+    own = hand.finger_markers
     width = max(map(len, own))
-    index = np.array([markers + [0] * (width - len(markers)) for markers in own])
+    index = np.array([(*markers, *[0] * (width - len(markers))) for markers in own])
     carried = np.zeros((3, len(FINGERS), width))
     for finger, markers in enumerate(own):
         for place, marker in enumerate(markers):
@@ -270,9 +270,5 @@ def _sine_and_cosine(axis: Array, covariance: Array) -> tuple[Array, Array]:
 
 def _turn(axis: Array, covariance: Array) -> Array:
     """`[..., 3, 3]` that turn as a rotation."""
-    both = jnp.stack(_sine_and_cosine(axis, covariance), -1)
-    both = _unit(both, jnp.array([0, 1], axis.dtype))
-    sine, cosine = both[..., :1, None], both[..., 1:, None]
-    eye, along = jnp.eye(3, dtype=axis.dtype), axis[..., :, None] * axis[..., None, :]
-    about = jnp.swapaxes(cross(axis[..., None, :], eye), -1, -2)
-    return cosine * (eye - along) + sine * about + along
+    angle = jnp.arctan2(*_sine_and_cosine(axis, covariance))
+    return rotation_from_vector(axis * angle[..., None])

@@ -22,7 +22,7 @@ from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from jaxhand.sparse_fit import PosePrior
 from jaxhand.tasks import JOINT_POINTS
 from numpy_infer.arrays import Array
-from numpy_infer.hand import CHAINS, Hand
+from numpy_infer.hand import CHAINS, Hand, bundled, load_hand
 from numpy_infer.model import Model
 from numpy_infer.pose import HandPose
 
@@ -54,10 +54,10 @@ def rows(
 ) -> dict[str, Row]:
     """The methods of Table 4 for a model, all with the data set's own bones but one.
 
-    `learned` is the pipeline, `learned_uncalibrated` the same with the bones that the model was
-    trained on, `mean_pose` with the mean angles of its training data; `ik` and `ik_tuned` are the
-    paper's rival on the same filled markers, and `least_squares` the likeliest posture, with the
-    prior that the model's training left behind.
+    `learned` is the pipeline, `learned_uncalibrated` the same on the bones of the bundled hand, as
+    somebody has it who never calibrates; `ik` and `ik_tuned` are the paper's rival on the same
+    filled markers, and `least_squares` the likeliest posture, with the prior that the model's
+    training left behind.
 
     Args:
         model: with both networks.
@@ -76,7 +76,9 @@ def rows(
         prior = PosePrior(*(np.array(posture[name], np.float32) for name in PosePrior._fields))
         found["least_squares"] = Row(filled, partial(_fit, wearer, prior))
     found["learned"] = Row(replace(learned, wearer=wearer))
-    found["learned_uncalibrated"] = Row(learned)
+    if model.hand.name in bundled():
+        average = model.hand.with_skeleton(load_hand(model.hand.name).skeleton)
+        found["learned_uncalibrated"] = Row(replace(learned, wearer=average))
     for name, other in (others or {}).items():
         found[name] = Row(replace(other, wearer=other.hand.with_skeleton(dataset.hand.skeleton)))
     return found

@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhand.arrow import FINGER, HIGH, LOW, SLOT
 from jaxhand.geometry import cross, kabsch, product, transform, untransform
 from jaxhand.ik import Solved, flat_frames, in_hand_frame, shaped, solved_from
 from jaxhand.skeleton import rotations_from_angles
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, JOINTS, Hand
+from numpy_infer.hand import ANGLES, Hand
 
 NOISE = 1e-3
 """Metres per axis: what one standard deviation of a marker is."""
@@ -35,14 +36,6 @@ a finger is not where the mean posture has it, but better than nothing if alignm
 STEPS = 30
 TOLERANCE = 3e-3
 """Radians: a frame is done when no angle's step is larger. Steps shrink quadratically."""
-
-_WIDTH = 6
-"""The most angles that a finger has: the thumb's."""
-_FINGER_OF = np.array([(JOINTS.index(a.joint) - 1) // 3 for a in ANGLES])
-"""`[26]` the finger of each angle."""
-_SLOT_OF = np.array([(_FINGER_OF[:i] == finger).sum() for i, finger in enumerate(_FINGER_OF)])
-"""`[26]` its place among the angles of its finger: one tangent moves that of all five fingers."""
-_RANGE = np.radians([a.range_deg for a in ANGLES]).T
 
 
 class PosePrior(NamedTuple):
@@ -145,10 +138,9 @@ def _posture(
     """Angles `[26]`, and turn `[3, 3]` and shift `[3]` of the wrist from its start, for the targets
     `[M, 3]` of one frame, as seen from that start."""
     dtype, count = target.dtype, len(ANGLES)
-    owner = np.array([(link + 2) // 3 - 1 for link in hand.links])
     # A finger's angles move none of the others' markers, and no tangent tells the fingers apart.
-    own = (owner[:, None] == _FINGER_OF)[:, None]
-    low, high = (jnp.asarray(end).astype(dtype) for end in _RANGE)
+    own = np.array([[m in hand.finger_markers[f] for f in FINGER] for m in range(len(hand))])
+    low, high = (jnp.asarray(end).astype(dtype) for end in (LOW, HIGH))
     wrist_scale = jnp.asarray(np.repeat(WRIST_PRIOR, 3)).astype(dtype)
     scale = seen[:, None].astype(dtype) / NOISE
 
@@ -172,8 +164,9 @@ def _posture(
     def slopes(unknowns: Array) -> Array:
         """`[3 M + 26, 32]` derivative of the residuals, without the priors' own, which is 1."""
         angles, wrist = unpacked(unknowns)
-        by_slot = jax.jacfwd(lambda slots: placed(angles + slots[_SLOT_OF]))
-        by_angle = jnp.where(own, by_slot(jnp.zeros(_WIDTH, dtype))[..., _SLOT_OF], 0)
+        by_slot = jax.jacfwd(lambda slots: placed(angles + slots[SLOT]))
+        by_slot = by_slot(jnp.zeros(SLOT.max() + 1, dtype))
+        by_angle = jnp.where(own[:, None], by_slot[..., SLOT], 0)
         by_angle = product(_small_turn(wrist[:3]), by_angle)
         by_wrist = jax.jacfwd(moved)(wrist, placed(angles)) * wrist_scale
         by_angle, by_wrist = (

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from numpy_infer import wearer
 from numpy_infer.hand import Hand, bundled, load_hand
 from numpy_infer.model import Model, load
 from numpy_infer.pose import Status, TrackingState
@@ -23,6 +24,8 @@ from numpy_infer.tracking import Tracked, track
 VERBS = {
     "train": "train both networks on recordings of hands",
     "evaluate": "measure a model beside the baselines (the paper's Table 3)",
+    "calibrate": "find the bones of whoever wears the glove, for the tracker",
+    "hand": "describe a new glove out of a recording, as a hand file",
     "demo": "the whole line on simulated hands, in a few minutes and with no data",
 }
 """Verbs of the JAX side, found through the entry points `jaxhand.verbs`."""
@@ -93,6 +96,9 @@ def parser() -> argparse.ArgumentParser:
         "--predictor", choices=tuple(PREDICTORS), help="instead of the model's; none: fill nothing"
     )
     tracked.add_argument("--joints", choices=("learned", "none"), help="instead of the model's")
+    tracked.add_argument(
+        "--calibration", type=Path, metavar="ME", help="the wearer's file from jaxhand calibrate"
+    )
     tracked.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     tracked.set_defaults(run=_track)
 
@@ -190,6 +196,8 @@ def _track(options: argparse.Namespace) -> None:
         model = replace(model, predictor=options.predictor)
     if options.joints:
         model = replace(model, joints=options.joints)
+    if options.calibration:
+        model = wearer.calibrated(model, wearer.load(options.calibration))
     show = sys.stderr.isatty()
 
     def report(share: float) -> None:

@@ -6,6 +6,7 @@ from enum import IntEnum, IntFlag
 from typing import Any, NamedTuple
 
 from numpy_infer.arrays import Array
+from numpy_infer.geometry import quaternion
 
 
 class Status(IntEnum):
@@ -63,6 +64,13 @@ class HandPose(NamedTuple):
     """`[...]` a `TrackingState`."""
     notice: Array
     """`[...]` flags of `Notice`."""
+
+    @property
+    def quaternions(self) -> Array | None:
+        """`[..., 16, 4]` xyzw, world_from_joint, w not negative: what `rotations` are, made when
+        asked for. Unlike the angles they know no gimbal lock (at ±90° of abduction flexion and
+        twist are one motion, see `skeleton.angles_from_rotations`)."""
+        return None if self.rotations is None else quaternion(self.rotations)
 
 
 class State(NamedTuple):

@@ -12,7 +12,7 @@ import pytest
 jax = pytest.importorskip("jax")
 
 from hypothesis import given  # noqa: E402
-from strategies import directions, motions, noise, rotations, turn  # noqa: E402
+from strategies import motions, noise, turn  # noqa: E402
 
 from jaxhand import simulation  # noqa: E402
 from jaxhand.datasets import MANIPNET_POINTS, PAVLLO_AXES, load  # noqa: E402
@@ -24,11 +24,19 @@ from jaxhand.fusion import (  # noqa: E402
     imu_from_recording,
     kalman_update,
     paper_fuse,
-    shortest_arc,
     simulate_imu,
 )
 from numpy_infer.arrays import Array  # noqa: E402
-from numpy_infer.hand import ANGLES, FINGERS, JOINTS, PARENTS, POINTS, Hand, load_hand  # noqa: E402
+from numpy_infer.hand import (  # noqa: E402
+    ANGLES,
+    CHAINS,
+    FINGERS,
+    JOINTS,
+    PARENTS,
+    POINTS,
+    Hand,
+    load_hand,
+)
 from numpy_infer.recordings import JointTruth, Recording, read  # noqa: E402
 from numpy_infer.skeleton import (  # noqa: E402
     angles_from_rotations,
@@ -262,6 +270,30 @@ def test_without_markers_the_glove_is_what_there_is() -> None:
         assert np.isfinite(fused.wrist_position).all()
 
 
+def test_the_papers_route_points_a_finger_at_its_marker_and_holds_the_turn() -> None:
+    """From the wrist, turns about the bases; what the glove feels meanwhile goes on beneath."""
+    hand, _, glove, markers, _ = recorded()
+    tips, bases = [hand.markers.index(f"{f}_tip") for f in FINGERS], [c[0] for c in CHAINS]
+    seen = markers.copy()
+    hidden = np.isin(np.arange(240), [*range(20), *range(100, 140)])
+    seen[hidden, hand.markers.index("middle_tip")] = np.nan
+    fused = paper_fuse(hand, glove, seen, 1 / RATE)
+    points, placed = world(hand, fused.rotations, fused.wrist_rotation, fused.wrist_position)
+    measured, modelled = (m[:, tips] - points[:, bases] for m in (seen, placed))
+    aside = np.linalg.norm(np.cross(measured, modelled), axis=-1)
+    assert np.nanmax(aside / np.linalg.norm(measured, axis=-1)) < 1e-5
+    assert np.nanmin((measured * modelled).sum(-1)) > 0
+    held = fused.rotations[:, ::3] @ np.swapaxes(glove[:, ::3], -1, -2)
+    middle = FINGERS.index("middle")
+    for frames, known in ((slice(0, 20), 20), (slice(100, 140), 99)):
+        np.testing.assert_allclose(
+            held[frames, middle], held[[known] * len(held[frames]), middle], atol=1e-6
+        )
+    np.testing.assert_array_equal(
+        np.delete(fused.rotations, np.s_[::3], 1), np.delete(glove, np.s_[::3], 1)
+    )
+
+
 def test_a_glove_that_drops_out_is_held() -> None:
     hand, _, glove, markers, _ = recorded()
     held, glove = glove.copy(), glove.copy()
@@ -311,38 +343,6 @@ def test_one_measurement_after_the_other_is_all_at_once(
     )
     np.testing.assert_allclose(mean, before + (gain @ away[..., None])[..., 0], atol=1e-4)
     np.testing.assert_allclose(after, covariance - gain @ rows @ covariance, atol=1e-4)
-
-
-def arc(a: Array, b: Array) -> Array:
-    return np.asarray(shortest_arc(np.float32(a), np.float32(b)), np.float64)
-
-
-@given(directions(), rotations(2.6))
-def test_the_shortest_arc_turns_one_direction_into_the_other(a: Array, rotation: Array) -> None:
-    a = 0.08 * a
-    b = 1.3 * rotation @ a
-    found = arc(a, b)
-    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-5)
-    np.testing.assert_allclose(1.3 * found @ a, b, atol=1e-6)
-    axis = np.cross(a, b)  # stands on both
-    np.testing.assert_allclose(found @ axis, axis, atol=1e-7)
-
-
-@given(directions(), directions())
-def test_the_arc_is_defined_and_continuous_where_there_is_no_shortest(a: Array, b: Array) -> None:
-    a = 0.05 * a
-    for singular in (-a, 0 * a):
-        np.testing.assert_allclose(arc(a, singular), np.eye(3), atol=1e-5)
-        for near in (1e-7, 1e-5, 1e-3):
-            found = arc(a, singular + near * b)
-            np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-5)
-    # Through both singularities in small steps, each of which turns it by little.
-    aside = np.cross(a, [0.3, 0.51, 0.87])
-    aside *= 0.05 / np.linalg.norm(aside)
-    around = np.linspace(0, 2 * np.pi, 2001)[:, None]
-    through = np.linspace(-2e-3, 2e-3, 2001)[:, None]
-    for path in (np.cos(around) * a + np.sin(around) * aside, through * b):
-        assert np.abs(np.diff(arc(np.broadcast_to(a, path.shape), path), axis=0)).max() < 0.1
 
 
 # --- recordings of gloves

@@ -14,6 +14,7 @@ pytest.importorskip("jax")
 import tyro
 
 from jaxhand.demo import DemoConfig
+from jaxhand.glove import CalibrateConfig, HandConfig
 from jaxhand.report import EvaluationConfig
 from jaxhand.training import TrainingConfig
 from numpy_infer import Model, load_hand
@@ -23,7 +24,13 @@ from numpy_infer.predictors import PREDICTORS
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 README = (REPOSITORY / "README.md").read_text("utf-8")
-CONFIGS = {"train": TrainingConfig, "evaluate": EvaluationConfig, "demo": DemoConfig}
+CONFIGS = {
+    "train": TrainingConfig,
+    "evaluate": EvaluationConfig,
+    "calibrate": CalibrateConfig,
+    "hand": HandConfig,
+    "demo": DemoConfig,
+}
 
 
 def blocks(language: str) -> list[str]:

@@ -638,6 +638,22 @@ def test_the_live_object_is_the_pure_pair_and_reset_forgets_all() -> None:
         hand_tracker.reset()
 
 
+def test_quaternions_are_the_rotations_also_where_angles_lock() -> None:
+    pose = HandTracker(a_model("affine", joints=True)).step(a_model("affine").hand.template, 0.01)
+    locked = np.array(turn([0, 1, 0], np.pi / 2) @ turn([1, 0, 0], 0.7))
+    pose = pose._replace(rotations=np.concatenate([pose.rotations[:-1], locked[None]]))
+    assert pose.quaternions is not None
+    x, y, z, w = np.moveaxis(pose.quaternions, -1, 0)
+    assert_allclose(x * x + y * y + z * z + w * w, 1, atol=1e-6)
+    assert (w >= 0).all()
+    for rotation, vector, angle in zip(
+        pose.rotations, np.stack([x, y, z], -1), 2 * np.arccos(np.clip(w, -1, 1)), strict=True
+    ):
+        if angle > 1e-3:
+            assert_allclose(turn(vector, angle), rotation, atol=1e-5)
+    assert HandTracker(a_model("affine")).step(np.zeros((9, 3)), 0.01).quaternions is None
+
+
 def test_a_hand_seen_in_millimetres_is_suspected() -> None:
     model = a_model("none")
     _, pose = tracker.step(

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from numpy_infer import HandTracker, Model, Status, TrackingState, load_hand
+from numpy_infer import HandTracker, Model, Status, TrackingState, load_hand, wearer
 from numpy_infer.cli import describe, main, parser
 from numpy_infer.recordings import Recording, read, write
 from numpy_infer.tracking import track
@@ -173,6 +173,19 @@ def test_a_label_map_renames(tmp_path: Path) -> None:
     assert main(arguments) == 2
     assert main([*arguments, "--map", str(labels)]) == 0
     assert read(out).names == HAND.markers
+
+
+def test_a_calibration_is_for_the_same_glove(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(recording_with_gaps(), tmp_path / "in.csv")
+    track_it = ["track", str(tmp_path / "in.csv"), "--model", "affine", "--calibration"]
+    for name, status in (("glove9", 0), ("dense19", 2)):
+        wearer.save(wearer.Wearer(load_hand(name)), tmp_path / f"{name}.json")
+        out = tmp_path / f"{name}.trc"
+        assert main([*track_it, str(tmp_path / f"{name}.json"), "-o", str(out)]) == status
+        assert out.exists() == (status == 0)
+    assert "the wearer's markers" in capsys.readouterr().err
 
 
 def test_every_verb_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:

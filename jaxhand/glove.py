@@ -1,0 +1,172 @@
+"""The verbs `calibrate` and `hand`: a person's bones for the tracker, a file for a new glove."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+
+from jaxhand.calibration import DENSE, Calibration, Priors, calibrate, new_hand
+from jaxhand.joint_evaluation import evaluate_poses
+from numpy_infer import wearer
+from numpy_infer.arrays import Array
+from numpy_infer.geometry import mirror
+from numpy_infer.hand import FINGERS, POINTS, load_hand
+from numpy_infer.model import Model
+from numpy_infer.model import load as load_model
+from numpy_infer.recordings import Recording, load_label_map, read
+from numpy_infer.wearer import Wearer
+
+SPARSE_PRIORS, SPARSE_NOISE = Priors(bone=0.003, offset=0.5e-3), 1e-3
+"""For a glove of fewer than `DENSE` markers. They cannot tell a long bone from a bent joint, only
+how large the hand is: with bones left free, joints came out worse on every hand tried, with these
+they never did."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _File:
+    recording: tyro.conf.Positional[Path]
+    """A marker file (TRC, TSV, CSV, C3D, …)."""
+    out: Annotated[Path, tyro.conf.arg(aliases=("-o",))]
+    """The file to write."""
+    right: bool = False
+    """It is a right hand."""
+    map: Path | None = None
+    """JSON file {"label in the file": "marker"}."""
+    unit: float | None = None
+    """Metres per unit, where the file does not say."""
+    left_handed: bool = False
+    """The file's coordinates are left-handed."""
+    overwrite: bool = False
+    """Replace the file if it exists."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CalibrateConfig(_File):
+    """The command line of `jaxhand calibrate`."""
+
+    model: Path
+    """The model that will track this person."""
+    flat: tuple[float, float] | None = None
+    """Seconds from and to which a flat hand is held, fingers together: what the joint network makes
+    of it is then taken off all it says (paper, section 2.2)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandConfig(_File):
+    """The command line of `jaxhand hand`."""
+
+    like: str = "glove9"
+    """A bundled hand, or a hand file, with markers of the same names at roughly these places."""
+    name: str | None = None
+    """The new hand's name; by default that of the file it is written to."""
+
+
+def calibrate_person(config: CalibrateConfig, console: Console | None = None) -> Wearer:
+    """Finds the bones of whoever wears a glove out of 5 to 30 s of free motion, and writes them.
+
+    Raises:
+        ValueError: a file that is none or exists already, or a recording that does not determine a
+            hand.
+    """
+    console = console or Console(soft_wrap=True, highlight=False)
+    recording, model = _read(config), load_model(config.model)
+    markers = _markers(recording, model.hand.markers, config.right)
+    flat = None if config.flat is None else _flat(model, recording, markers, config.flat)
+    with console.status("fitting bones, angles and poses"):
+        if len(model.hand) >= DENSE:
+            found = calibrate(model.hand, markers, rate=recording.rate)
+        else:
+            found = calibrate(
+                model.hand,
+                markers,
+                rate=recording.rate,
+                priors=SPARSE_PRIORS,
+                noise=SPARSE_NOISE,
+            )
+    unseen = tuple(finger for finger, seen in zip(FINGERS, found.seen, strict=True) if not seen)
+    person = Wearer(found.hand, flat, unseen)
+    wearer.save(person, config.out, overwrite=config.overwrite)
+    _tell(found, model, unseen, console)
+    console.print(
+        f"wrote {config.out}; HandTracker.load(…, calibration=…) and jaxhand track "
+        "--calibration take it"
+    )
+    return person
+
+
+def describe_glove(config: HandConfig, console: Console | None = None) -> None:
+    """Writes a hand file for a new glove out of some ten seconds of flat and free motion.
+
+    Raises:
+        ValueError: as `calibrate_person`.
+    """
+    console = console or Console(soft_wrap=True, highlight=False)
+    like, recording = load_hand(config.like), _read(config)
+    markers = _markers(recording, like.markers, config.right)
+    with console.status("fitting bones, offsets, angles and poses"):
+        hand = new_hand(
+            like,
+            like.markers,
+            markers,
+            rate=recording.rate,
+            name=config.name or config.out.stem,
+        )
+    hand = replace(hand, sources=(f"fitted to a recording, from {like.name}",))
+    config.out.write_text(json.dumps(hand.to_json(), indent=1) + "\n", "utf-8")
+    moved = 1e3 * np.linalg.norm(hand.template - like.template, axis=-1)
+    for name, distance in zip(hand.markers, moved, strict=True):
+        console.print(f"{name}: {distance:.0f} mm from where {like.name} has it")
+    console.print(f"wrote {config.out}")
+
+
+def _read(config: _File) -> Recording:
+    if config.out.exists() and not config.overwrite:
+        raise ValueError(f"{config.out} exists: choose another name, or pass --overwrite")
+    return read(
+        config.recording,
+        unit=config.unit,
+        left_handed=config.left_handed,
+        label_map=load_label_map(config.map) if config.map else None,
+    )
+
+
+def _markers(recording: Recording, names: tuple[str, ...], right: bool) -> Array:
+    """`[T, M, 3]` metres, of a canonical left hand."""
+    markers = recording.select(names).markers
+    return mirror(markers) if right else markers
+
+
+def _flat(
+    model: Model, recording: Recording, markers: Array, seconds: tuple[float, float]
+) -> Array:
+    """`[26]` radians: what the joint network says of the hand that is held flat meanwhile."""
+    if model.joint_network is None:
+        raise ValueError("--flat: the model has no joint network to calibrate")
+    since = recording.time - recording.time[0]
+    held = (since >= seconds[0]) & (since <= seconds[1]) & np.isfinite(markers).all((-1, -2))
+    if not held.any():
+        raise ValueError(
+            f"--flat: no frame with all markers from {seconds[0]:g} to {seconds[1]:g} s; the "
+            f"recording lasts {since[-1]:.1f} s"
+        )
+    poses = evaluate_poses(replace(model, alignment=False), markers[held].astype(np.float32))
+    angles: Array = poses.angles
+    return angles.mean(0)
+
+
+def _tell(found: Calibration, model: Model, unseen: tuple[str, ...], console: Console) -> None:
+    lengths = (np.linalg.norm(hand.skeleton, axis=-1)[1:] for hand in (found.hand, model.hand))
+    now, before = lengths
+    off = 1e3 * np.nanmean(found.residual)
+    console.print(f"{len(found.tracked)} frames; markers fit within {off:.1f} mm on average")
+    console.print(f"bones are {100 * (now.sum() / before.sum() - 1):+.1f} % of the model's in all")
+    for point, new, old in zip(POINTS[1:], now, before, strict=True):
+        console.print(f"  {point:11} {1e3 * new:5.1f} mm ({1e3 * (new - old):+.1f})")
+    for finger in unseen:
+        console.print(f"not seen yet: the {finger}; bend and stretch it for a better fit")

@@ -1,0 +1,92 @@
+"""The verbs that take a person's or a new glove's measure."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+jax = pytest.importorskip("jax")
+pytest.importorskip("tyro")
+
+from streams import a_model  # noqa: E402
+
+from jaxhand import cli, simulation  # noqa: E402
+from numpy_infer import load_hand, model, wearer  # noqa: E402
+from numpy_infer.geometry import mirror  # noqa: E402
+from numpy_infer.hand import POINTS  # noqa: E402
+from numpy_infer.recordings import Recording, write  # noqa: E402
+
+GLOVE = load_hand("glove9")
+RATE, SECONDS, LARGER = 60.0, 6, 1.12
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A model on average bones, and six seconds of a hand that is 12 % larger, flat at first."""
+    folder = tmp_path_factory.mktemp("glove")
+    model.save(a_model("learned", joints=True), folder / "model.npz")
+    frames = round(RATE * SECONDS)
+    skeleton = np.float32(LARGER * GLOVE.skeleton)
+    move = simulation.motion(jax.random.key(3), frames, RATE)
+    ease = np.clip(np.arange(frames) / RATE - 1, 0, 1)[:, None]
+    markers = simulation.markers(
+        GLOVE, skeleton, move.angles * ease, move.wrist_rotation, move.wrist_position
+    )
+    noise = 0.3e-3 * np.random.default_rng(0).standard_normal(markers.shape)
+    markers = np.asarray(markers, np.float64) + noise
+    time = np.arange(frames) / RATE
+    write(Recording(GLOVE.markers, markers, time, RATE, source=""), folder / "left.csv")
+    write(Recording(GLOVE.markers, mirror(markers), time, RATE, source=""), folder / "right.csv")
+    return folder
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_larger_hand_is_found_to_be_larger(side: str, folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "me.json"
+    arguments = [str(folder / f"{side}.csv"), "--model", str(folder / "model.npz"), "-o", str(out)]
+    right = ["--right"] if side == "right" else []
+    assert cli.calibrate([*arguments, "--flat", "0", "0.8", *right]) == 0
+    person = wearer.load(out)
+    lengths, average = (np.array(list(h.bone_lengths.values())) for h in (person.hand, GLOVE))
+    assert np.abs(lengths / average - LARGER).max() < 0.03
+    assert person.flat is not None
+    assert cli.calibrate(arguments) == 2, "nothing is overwritten unasked"
+
+
+def test_a_glove_is_described_by_its_motion(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "mine.json"
+    assert cli.hand([str(folder / "left.csv"), "--like", "glove9", "-o", str(out)]) == 0
+    hand = load_hand(out)
+    assert hand.name == "mine"
+    assert hand.markers == GLOVE.markers
+    palm = [POINTS.index(point) for point in ("index_mcp", "pinky_mcp")]
+    apart = np.linalg.norm(np.subtract(*hand.template[[0, 2]]))
+    wanted = LARGER * np.linalg.norm(np.subtract(*GLOVE.skeleton[palm]))
+    assert abs(apart - wanted) < 3e-3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"--model": "nothing.npz"}, "no model file nothing.npz"),
+        ({"--flat": "20"}, "no frame with all markers"),
+        ({"recording": "nothing.csv"}, "nothing.csv"),
+    ],
+)
+def test_a_mistake_is_one_clear_line(
+    change: dict[str, str],
+    message: str,
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given = {"--model": str(folder / "model.npz"), "--flat": "0", **change}
+    recording = change.get("recording", str(folder / "left.csv"))
+    arguments = [recording, "-o", str(tmp_path / "me.json"), "--model", given["--model"]]
+    assert cli.calibrate([*arguments, "--flat", given["--flat"], "30"]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "me.json").exists()

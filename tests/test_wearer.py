@@ -1,0 +1,124 @@
+"""A calibration changes bones, wrist and flat pose of the joints, and nothing of the markers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from streams import Stream, a_model, motion, restless, run
+
+from numpy_infer import HandTracker, load_hand, model, wearer
+from numpy_infer.hand import ANGLES
+from numpy_infer.skeleton import rotations_from_angles
+from numpy_infer.wearer import Wearer
+
+GLOVE = load_hand("glove9")
+LARGER = GLOVE.with_skeleton(1.1 * GLOVE.skeleton)
+FLAT = np.linspace(-0.3, 0.4, len(ANGLES))
+
+
+@pytest.mark.parametrize("flat", [None, FLAT])
+def test_a_calibration_reads_back(flat: Any, tmp_path: Path) -> None:
+    wearer.save(Wearer(LARGER, flat, ("ring", "pinky")), tmp_path / "me.json")
+    back = wearer.load(tmp_path / "me.json")
+    assert_array_equal(back.hand.skeleton, LARGER.skeleton)
+    assert_array_equal(back.hand.offsets, LARGER.offsets)
+    assert_array_equal(back.hand.template, LARGER.template)
+    assert back.unseen == ("ring", "pinky")
+    assert (back.flat is None) == (flat is None)
+    if flat is not None:
+        assert_array_equal(back.flat, flat)
+    with pytest.raises(ValueError, match="overwrite"):
+        wearer.save(back, tmp_path / "me.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("flat"), "expected an object with"),
+        (lambda d: d.update(version=2), "version 1, found"),
+        (lambda d: d.update(flat={"index_mcp_flexion": 0.1}), "'flat': expected the 26 angles"),
+        (lambda d: d["flat"].update(index_mcp_twist=float("nan")), "'flat': expected radians"),
+        (lambda d: d["flat"].update(index_mcp_twist="1"), "'flat': expected radians"),
+        (lambda d: d.update(unseen=["nose"]), "'unseen': expected fingers"),
+        (lambda d: d["hand"]["markers"].pop(), "alignment marker|template"),
+    ],
+)
+def test_what_is_wrong_in_a_file_is_named(change: Any, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "me.json"
+    wearer.save(Wearer(LARGER, FLAT), path)
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+    with pytest.raises(ValueError, match=message) as error:
+        wearer.load(path)
+    assert str(error.value).startswith(str(path))
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{", '"x"', "[" * 100_000])
+def test_what_is_no_calibration_is_a_value_error(content: str, tmp_path: Path) -> None:
+    (tmp_path / "me.json").write_text(content)
+    with pytest.raises(ValueError, match=r"me\.json"):
+        wearer.load(tmp_path / "me.json")
+    with pytest.raises(ValueError, match="no calibration file"):
+        wearer.load(tmp_path / "nobody.json")
+
+
+def test_another_gloves_calibration_is_refused() -> None:
+    with pytest.raises(ValueError, match="wearer's markers"):
+        wearer.calibrated(a_model("affine"), Wearer(load_hand("dense19")))
+
+
+def test_a_calibrated_model_is_not_saved_as_a_model(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="save the model, and the calibration"):
+        model.save(wearer.calibrated(a_model("affine"), Wearer(LARGER)), tmp_path / "m.npz")
+
+
+def stream() -> Stream:
+    rng = np.random.default_rng(2)
+    truth = motion(LARGER, rng, 40, 2)
+    return Stream(truth, restless(rng, truth.shape[:-1]), np.full(truth.shape[:2], 1 / 60))
+
+
+def test_markers_do_not_change_with_the_wearer() -> None:
+    plain = a_model("learned", joints=True)
+    own = wearer.calibrated(plain, Wearer(LARGER, FLAT))
+    one, other = run(plain, stream())[0], run(own, stream())[0]
+    assert_array_equal(one.markers, other.markers)
+    assert_array_equal(one.status, other.status)
+    assert np.abs(one.positions - other.positions).max() > 1e-3
+
+
+def test_joints_stand_on_the_wearers_bones() -> None:
+    own = wearer.calibrated(a_model("learned", joints=True), Wearer(LARGER))
+    pose, _ = run(own, stream())
+    bone = np.linalg.norm(pose.positions[..., 5, :] - pose.positions[..., 4, :], axis=-1)
+    assert_allclose(bone, LARGER.bone_lengths["index_pip"], rtol=1e-6)
+
+
+def test_the_same_bones_change_nothing() -> None:
+    plain = a_model("learned", joints=True)
+    same = wearer.calibrated(plain, Wearer(plain.hand))
+    one, other = run(plain, stream())[0], run(same, stream())[0]
+    assert_allclose(other.positions, one.positions, rtol=0, atol=1e-6)
+    assert_allclose(other.rotations, one.rotations, rtol=0, atol=1e-6)
+
+
+def test_a_hand_held_as_it_was_when_flat_is_flat(tmp_path: Path) -> None:
+    plain = replace(a_model("learned", joints=True), alignment=False)
+    markers = motion(GLOVE, np.random.default_rng(4), 1, 1)[0, 0]
+    held = HandTracker(plain).step(markers, 1 / 60)
+    model.save(plain, tmp_path / "m.npz")
+    wearer.save(Wearer(GLOVE, held.angles), tmp_path / "me.json")
+    tracker = HandTracker.load(tmp_path / "m.npz", calibration=tmp_path / "me.json")
+    pose = tracker.step(markers, 1 / 60)
+    assert_allclose(pose.angles, 0, atol=1e-4)
+    # In the parent's frame: the inverse of the flat rotation, composed onto what is predicted.
+    assert_allclose(
+        rotations_from_angles(pose.angles), np.broadcast_to(np.eye(3), (15, 3, 3)), atol=1e-4
+    )
