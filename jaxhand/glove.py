@@ -16,7 +16,7 @@ from jaxhand.joint_evaluation import evaluate_poses
 from numpy_infer import wearer
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import mirror
-from numpy_infer.hand import FINGERS, POINTS, load_hand
+from numpy_infer.hand import FINGERS, POINTS, Hand, load_hand
 from numpy_infer.model import Model
 from numpy_infer.model import load as load_model
 from numpy_infer.recordings import Recording, load_label_map, read
@@ -79,16 +79,7 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
     markers = _markers(recording, model.hand.markers, config.right)
     flat = None if config.flat is None else _flat(model, recording, markers, config.flat)
     with console.status("fitting bones, angles and poses"):
-        if len(model.hand) >= DENSE:
-            found = calibrate(model.hand, markers, rate=recording.rate)
-        else:
-            found = calibrate(
-                model.hand,
-                markers,
-                rate=recording.rate,
-                priors=SPARSE_PRIORS,
-                noise=SPARSE_NOISE,
-            )
+        found = calibrated_hand(model.hand, markers, recording.rate)
     unseen = tuple(finger for finger, seen in zip(FINGERS, found.seen, strict=True) if not seen)
     person = Wearer(found.hand, flat, unseen)
     wearer.save(person, config.out, overwrite=config.overwrite)
@@ -98,6 +89,20 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
         "--calibration take it"
     )
     return person
+
+
+def calibrated_hand(hand: Hand, markers: Array, rate: float) -> Calibration:
+    """The fit behind `jaxhand calibrate`: bones and marker places of a dense glove, of a sparse one
+    hardly more than the size.
+
+    Args:
+        hand: the model's.
+        markers: `[T, M, 3]` metres, of a canonical left hand; NaN where hidden.
+        rate: frames per second.
+    """
+    if len(hand) >= DENSE:
+        return calibrate(hand, markers, rate=rate)
+    return calibrate(hand, markers, rate=rate, priors=SPARSE_PRIORS, noise=SPARSE_NOISE)
 
 
 def describe_glove(config: HandConfig, console: Console | None = None) -> None:
