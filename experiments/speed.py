@@ -20,6 +20,8 @@ import jax
 import numpy as np
 
 from jaxhand import simulation, tasks, training
+from jaxhand.joints import joint_stage
+from jaxhand.sparse_fit import least_squares, prior_of
 from jaxhand.tasks import Frames
 from jaxhand.training import TrainingConfig, fit_networks
 from numpy_infer.arrays import Array
@@ -101,6 +103,25 @@ def print_tracking(model: Model, rounds: int) -> None:
     print(f"  {'ratio':28} {spread(taken['step'] / taken['networks'])}")
 
 
+def print_joints(model: Model, rounds: int, frames: int = 1000) -> None:
+    """Joints of complete frames in JAX: the learned stage beside the likeliest posture."""
+    hand = model.hand
+    markers, angles = simulation.frames(jax.random.key(3), hand, frames)
+    prior = prior_of(np.asarray(angles))
+    wrist = np.broadcast_to(np.eye(3, dtype=np.float32), (frames, 3, 3)), np.zeros((frames, 3))
+    stage = jax.jit(joint_stage)
+    still = tuple(np.asarray(part, np.float32) for part in wrist)
+    runs = {
+        "learned": lambda: jax.block_until_ready(stage(model, markers, *still)),
+        "least_squares": lambda: jax.block_until_ready(least_squares(hand, markers, prior)),
+    }
+    taken = interleaved(runs, rounds)
+    print("\nJAX, joints of 1,000 complete frames at once, µs a frame")
+    for name, seconds in taken.items():
+        print(f"  {name:28} {spread(1e6 * seconds / frames, 1)}")
+    print(f"  {'ratio':28} {spread(taken['least_squares'] / taken['learned'], 0)}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=21, help="epochs of each kind")
@@ -108,6 +129,7 @@ def main() -> None:
     options = parser.parse_args()
     model = print_training(options.rounds)
     print_tracking(model, options.frames)
+    print_joints(model, options.rounds)
 
 
 if __name__ == "__main__":

@@ -100,4 +100,7 @@ def _told(verb: str, run: Callable[[], object]) -> int:
     except (ValueError, OSError) as error:
         print(f"jaxhand {verb}: {error}", file=sys.stderr)
         return 2
+    except KeyboardInterrupt:
+        print(f"jaxhand {verb}: stopped", file=sys.stderr)
+        return 130
     return 0

@@ -157,20 +157,27 @@ def load(
     unknown = [take for take in chosen if take not in files]
     if unknown or not chosen:
         lacks = f"no take {', '.join(unknown)}" if unknown else f"no default {split!r} split"
-        raise ValueError(f"{spec.path}: {lacks}; pass takes out of: {', '.join(sorted(files))}")
+        raise ValueError(
+            f"{spec.path}: {lacks}; name takes with --{split}, out of: {', '.join(sorted(files))}"
+        )
     hand = load_hand(source.hand) if hand is None else hand
     paths = tuple(path for take in dict.fromkeys(chosen) for path in files[take])
     dataset = source.read(paths, hand, Reading(unit, left_handed))
     return replace(dataset, name=spec.name, weight=spec.weight)
 
 
-_SIDE = re.compile(r"[ _.-]?(?<![a-z])(left|right)(hand)?(?![a-z])", re.IGNORECASE)
+_SIDE = re.compile(
+    r"[ _.-]?(?<![A-Za-z])(left|right|LEFT|RIGHT)([Hh]and|HAND)?(?![a-z])"
+    r"|[ _.-]?(Left|Right)([Hh]and)?(?![a-z])"
+)
 
 
 def _without_side(stem: str) -> tuple[str, str]:
     """`cube_med2_leftHand` → (`cube_med2`, `left`); a file that does not say is a left hand."""
     found = _SIDE.search(stem)
-    return (_SIDE.sub("", stem, count=1), found[1].lower()) if found else (stem, "left")
+    if not found:
+        return stem, "left"
+    return _SIDE.sub("", stem, count=1), (found[1] or found[3]).lower()
 
 
 def _measured(
@@ -384,6 +391,8 @@ def _files(pattern: str, take: Callable[[Path], str]) -> Callable[[Path], dict[s
     def found(path: Path) -> dict[str, list[Path]]:
         files: dict[str, list[Path]] = {}
         for file in sorted(path.glob(pattern)) if path.is_dir() else [path]:
+            if file.name.startswith("."):
+                continue
             if file.suffix.lower() in SUFFIXES and not file.name.startswith("out_fused_"):
                 files.setdefault(take(file), []).append(file)
         return files

@@ -22,6 +22,7 @@ import numpy as np
 
 from jaxhand import sequences as data
 from jaxhand import tracker
+from jaxhand.predictors import PREDICTORS
 from numpy_infer.arrays import Array
 from numpy_infer.model import Model
 from numpy_infer.pose import HandPose
@@ -64,10 +65,12 @@ class Starts(NamedTuple):
 
 
 def methods(model: Model) -> dict[str, Model]:
-    """The rows of Table 3 for a model: the baselines on its hand, and what it has learned."""
+    """The rows of Table 3 for a model: every registered predictor on its hand, and what it has
+    learned with and without continuity."""
     rows = {
         name: replace(model, predictor=name, joints="none")
-        for name in ("last_known", "moving_average", "affine")
+        for name in PREDICTORS
+        if name not in ("learned", "none")
     }
     if model.marker_network is not None:
         learned = replace(model, predictor="learned", joints="none")

@@ -21,9 +21,7 @@ from jaxhand.joint_evaluation import joint_errors
 from jaxhand.options import AlsoModels, DataSets, Takes
 from numpy_infer.model import Model
 from numpy_infer.model import load as load_model
-from numpy_infer.predictors import PREDICTORS
-
-BASELINES = tuple(name for name in PREDICTORS if name not in ("learned", "none"))
+from numpy_infer.predictors import BASELINES
 
 
 @dataclass(frozen=True)

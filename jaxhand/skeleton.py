@@ -125,10 +125,10 @@ def align_fingers(
     Returns:
         `[..., 15, 3, 3]` parent_from_joint.
     """
-    ends = np.array([own[-1] if own else -1 for own in hand.finger_markers])
+    ends, has = hand.end_markers
     base = positions[..., 1:16:3, :]
     modelled = marker_positions(hand, positions, rotations)[..., ends, :] - base
-    share = weight[..., ends] * (ends >= 0).astype(weight.dtype)
+    share = weight[..., ends] * has.astype(weight.dtype)
     measured = jnp.where(share[..., None] > 0, markers[..., ends, :] - base, modelled)
     turn = shortest_arc(modelled, measured, share)
     wrist = rotations[..., :1, :, :]
@@ -155,7 +155,7 @@ def align_thumb(
     axes = product(rotations[..., 1:4, :, :], jnp.asarray(JOINT_AXES[:3], local.dtype))
     axes = axes.swapaxes(-1, -2)[..., THUMB_ANGLES[0], THUMB_ANGLES[1], :]
     arms = modelled[..., None, :, :] - positions[..., 1 + THUMB_ANGLES[0], None, :]
-    carried = np.array(hand.links)[own] > THUMB_ANGLES[0][:, None]
+    carried = hand.placing[1][own] > THUMB_ANGLES[0][:, None]
     reach = pull[..., None, :, :] * carried[..., None].astype(local.dtype)
     slopes = cross(axes[..., None, :], arms) * reach
     slopes = slopes.reshape(*slopes.shape[:-2], -1)

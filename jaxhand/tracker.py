@@ -93,7 +93,7 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         correction=jnp.zeros_like(template),
         anchor=template,
         prior=eye,
-        age=jnp.zeros((*batch, count), dtype),
+        age=jnp.full((*batch, count), ERROR_AGES[-1], dtype),
     )
 
 

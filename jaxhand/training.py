@@ -23,7 +23,7 @@ import optax
 import tyro
 from rich.console import Console
 
-from jaxhand import runs
+from jaxhand import runs, simulation
 from jaxhand.datasets import Split, load
 from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
@@ -115,7 +115,8 @@ class TrainingConfig:
     joint_layers: Layers = (Dense(200), Dense(200), Dense(200))
     """Hidden layers of the joint network, likewise."""
     joints: bool = True
-    """Train the joint network too, where the data have joint truth."""
+    """Train the joint network too: on the data's joint truth or, where there is none, on simulated
+    postures in the same glove."""
     position_weight: float = 30.0
     """Weight of the joints' positions, through forward kinematics, in the joint network's loss
     beside the mean square of its angles."""
@@ -292,6 +293,7 @@ def fit_networks(
     config: TrainingConfig,
     report: Report = lambda _: None,
     folder: Path | None = None,
+    joint_frames: tuple[Frames, Frames] | None = None,
 ) -> Model:
     """Trains on arrays, without any data set on disk.
 
@@ -304,6 +306,7 @@ def fit_networks(
         report: called after every epoch.
         folder: where metrics and checkpoints are kept and, if there are any, gone on from; None
             keeps nothing.
+        joint_frames: frames to train and validate the joint network on instead; with angles.
 
     Raises:
         ValueError: misshapen or too few frames, or no loss was finite.
@@ -315,11 +318,23 @@ def fit_networks(
         training, validation = (x._replace(angles=None) for x in (training, validation))
     _check_frames("training", training, hand, config.batch)
     _check_frames("validation", validation, hand, 1)
-    tasks = [partial(marker_task, hidden=config.marker_layers, occlusions=config.occlusions)]
-    if training.angles is not None and validation.angles is not None:
+    tasks = [
+        partial(
+            marker_task,
+            training,
+            validation,
+            hand,
+            hidden=config.marker_layers,
+            occlusions=config.occlusions,
+        )
+    ]
+    joint_frames = joint_frames or (training, validation)
+    if all(frames.angles is not None for frames in joint_frames):
         tasks.append(
             partial(
                 joint_task,
+                *joint_frames,
+                hand,
                 hidden=config.joint_layers,
                 position_weight=config.position_weight,
                 augmentation=Augmentation(config.mixed, config.drawn),
@@ -329,7 +344,7 @@ def fit_networks(
     summary: dict[str, Any] = {"frames": len(training.markers), "interrupted": False}
     for number, make in enumerate(tasks):
         key = jax.random.fold_in(jax.random.key(config.seed), number)
-        task = make(training, validation, hand, key=key)
+        task = make(key=key)
         fit, summary["interrupted"] = _fit(task, config, key, report, folder)
         if math.isfinite(fit.plateau.best):
             networks[task.name] = jax.tree.map(np.asarray, replace(task.network, arrays=fit.best))
@@ -343,9 +358,9 @@ def fit_networks(
         raise KeyboardInterrupt
     joints = "learned" if "joint_network" in networks else "none"
     if joints == "learned":
-        known = training.angles[np.isfinite(training.angles).all(-1)]  # type: ignore[index, arg-type]
+        angles = np.asarray(joint_frames[0].angles)
         # What the rival that fits postures knows of them, see `sparse_fit`.
-        posture = prior_of(np.asarray(known))._asdict()
+        posture = prior_of(angles[np.isfinite(angles).all(-1)])._asdict()
         summary["posture"] = {name: array.tolist() for name, array in posture.items()}
     return Model(hand, predictor="learned", joints=joints, training=summary, **networks)
 
@@ -439,14 +454,39 @@ def train(config: TrainingConfig) -> Model:
             f"rate {m.learning_rate:.1e}  {m.frames_per_second:,.0f} frames/s  at most {left} left"
         )
 
-    model = fit_networks(gather(training), gather(validation), hand, config, report, config.out)
+    frames, held_out = gather(training), gather(validation)
+    joint_frames = None
+    if config.joints and (frames.angles is None or held_out.angles is None):
+        console.print(
+            "the data hold no joints: the joint network is trained on simulated postures of "
+            f"{hand.name}"
+        )
+        joint_frames = simulated_frames(hand, config.seed)
+    model = fit_networks(frames, held_out, hand, config, report, config.out, joint_frames)
     if model.training["interrupted"]:
         console.print("interrupted: the best weights so far are kept; --resume goes on")
     model = replace(model, training={**model.training, "config": _plain(config)})
-    model = finish(model, [s for d in validation for s in d.sequences], console.print)
+    try:
+        model = finish(model, [s for d in validation for s in d.sequences], console.print)
+    except KeyboardInterrupt:
+        console.print("interrupted: fade and expected error keep their defaults")
     model = export(model, config.out / "model.npz", overwrite=True)
     console.print(f"wrote {config.out / 'model.npz'}")
     return model
+
+
+SIMULATED = 20_000
+"""Postures to train the joint network on where the data hold none; a tenth of it to validate on."""
+
+
+def simulated_frames(hand: Hand, seed: int) -> tuple[Frames, Frames]:
+    """Postures of simulated people in a glove, to train and to validate a joint network on."""
+    keys = jax.random.split(jax.random.key(seed))
+    parts = [
+        simulation.frames(key, hand, count)
+        for key, count in zip(keys, (SIMULATED, SIMULATED // 10), strict=True)
+    ]
+    return Frames(*parts[0]), Frames(*parts[1])
 
 
 def mean_hand(datasets: list[Dataset]) -> Hand:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy_infer import wearer
 from numpy_infer.hand import Hand, bundled, load_hand
 from numpy_infer.model import Model, load
-from numpy_infer.pose import Status, TrackingState
-from numpy_infer.predictors import PREDICTORS
+from numpy_infer.pose import Notice, Status, TrackingState
+from numpy_infer.predictors import BASELINES, PREDICTORS
 from numpy_infer.recordings import Recording, load_label_map, read, write
 from numpy_infer.tracking import Tracked, track
 
@@ -29,8 +29,6 @@ VERBS = {
     "demo": "the whole line on simulated hands, in a few minutes and with no data",
 }
 """Verbs of the JAX side, found through the entry points `jaxhand.verbs`."""
-
-BASELINES = ("last_known", "moving_average", "affine")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -45,6 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"jaxhand {options.verb}: {error}", file=sys.stderr)
         return 2
+    except BrokenPipeError:  # `| head` has read enough
+        sys.stderr.close()
     except KeyboardInterrupt:
         print(f"\njaxhand {options.verb}: stopped; no file was changed", file=sys.stderr)
         return 130
@@ -190,6 +190,8 @@ def describe(recording: Recording) -> dict[str, Any]:
 def _track(options: argparse.Namespace) -> None:
     if options.output.exists() and not options.overwrite:
         raise ValueError(f"{options.output} exists: choose another name, or pass --overwrite")
+    if options.output.exists() and options.output.samefile(options.file):
+        raise ValueError(f"{options.output} is the recording itself: choose another name")
     recording = _read(options)
     model = _model(options, recording)
     if options.predictor:
@@ -221,6 +223,8 @@ def _summary(result: Tracked) -> str:
         (Status.HELD, "held: nothing in the frame determined them"),
     ):
         lines.append(f"{100 * (status == name).mean():6.2f} % of the markers {text}")
+    if (result.notice & Notice.SUSPECTED_MILLIMETRES).any():
+        lines.append("the hand is metres in size: is the file's unit right? see --unit")
     hidden = status == Status.PREDICTED
     if hidden.any():
         error = 1e3 * result.expected_error[hidden].mean()

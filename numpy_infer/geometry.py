@@ -141,14 +141,18 @@ def _proper(left: Array, right: Array) -> Array:
 def rotation_from_vector(vector: Array) -> Array:
     """`[..., 3]` rotation vectors, radians → `[..., 3, 3]` (Rodrigues' formula). Right at and near
     no rotation, where the axis is not known: what it multiplies vanishes there."""
-    angle: Array = np.sqrt((vector * vector).sum(-1))[..., None, None]
-    axis = vector / np.where(angle > 0, angle, 1)[..., 0]
-    x, y, z = axis[..., 0], axis[..., 1], axis[..., 2]
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    crossing = np.stack([np.stack(row, -1) for row in rows], -2)
-    turned = np.sin(angle) * crossing + (1 - np.cos(angle)) * crossing @ crossing
-    return turned + np.eye(3, dtype=vector.dtype)
+    angle: Array = np.sqrt((vector * vector).sum(-1, keepdims=True))
+    axis = vector / np.where(angle > 0, angle, 1)
+    basis = _CROSS_BASIS.astype(vector.dtype, copy=False)
+    crossing = (axis @ basis).reshape(*vector.shape, 3)
+    angle = angle[..., None]
+    turned = np.sin(angle) * crossing + (1 - np.cos(angle)) * (crossing @ crossing)
+    return turned + _EYE.astype(vector.dtype, copy=False)
+
+
+_EYE = np.eye(3)
+_CROSS_BASIS = np.cross(_EYE[:, None], -_EYE).reshape(3, 9)
+"""`[3, 9]` a vector times this is its cross-product matrix."""
 
 
 def shortest_arc(source: Array, target: Array, share: Array) -> Array:
@@ -158,14 +162,15 @@ def shortest_arc(source: Array, target: Array, share: Array) -> Array:
     Vectors `[..., 3]` without length turn nothing. Between opposite ones every half turn is least:
     the one about the coordinate axis farthest from them, made perpendicular, is taken.
     """
-    crossed = cross(source, target)
-    sine = np.sqrt((crossed * crossed).sum(-1))
+    axis: Array = cross(source, target)
+    sine = np.sqrt((axis * axis).sum(-1))
     cosine = (source * target).sum(-1)
-    farthest: Array = np.eye(3, dtype=source.dtype)[np.argmin(np.abs(source), -1)]
-    aside = cross(source, farthest)
     opposite = (sine <= 1e-6 * np.abs(cosine)) & (cosine < 0)
-    axis: Array = np.where(opposite[..., None], aside, crossed)
-    length = np.sqrt((axis * axis).sum(-1))
+    length = sine
+    if opposite.any():
+        farthest = _EYE.astype(source.dtype)[np.argmin(np.abs(source), -1)]
+        axis = np.where(opposite[..., None], cross(source, farthest), axis)
+        length = np.sqrt((axis * axis).sum(-1))
     angle = share * np.arctan2(sine, cosine)
     return rotation_from_vector(axis * (angle / np.where(length > 0, length, 1))[..., None])
 

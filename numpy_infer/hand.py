@@ -170,6 +170,17 @@ class Hand:
             tuple(sorted(own, key=lambda i: (self.links[i], self.joints[i]))) for own in carried
         )
 
+    @cached_property
+    def end_markers(self) -> tuple[Array, Array]:
+        """`[5]` each: the outermost marker of each finger, and 1 where it has one, else 0."""
+        ends = np.array([own[-1] if own else -1 for own in self.finger_markers])
+        return ends, (ends >= 0).astype(np.float32)
+
+    @cached_property
+    def placing(self) -> tuple[Array, Array]:
+        """`[M]` each: `joints` and `links` as arrays."""
+        return np.array(self.joints), np.array(self.links)
+
     @property
     def bone_lengths(self) -> dict[str, float]:
         """Metres from each point's parent to it, without the wrist."""

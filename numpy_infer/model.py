@@ -98,7 +98,7 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
 
     Raises:
         ValueError: the file exists and `overwrite` is False; or the model holds what could not be
-            read back, or a calibration, which has a file of its own (`calibration.save`).
+            read back, or a calibration, which has a file of its own (`wearer.save`).
     """
     if model.wearer is not None or model.flat is not None:
         raise ValueError("a calibrated model is no model file: save the model, and the calibration")

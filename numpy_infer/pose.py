@@ -107,7 +107,8 @@ class State(NamedTuple):
     """`[..., 3, 3]` anchor_from_template before the corrections were set: what the registration
     follows as long as the visible set is the same, where markers do not determine it."""
     age: Array
-    """`[..., M]` seconds since the marker was measured."""
+    """`[..., M]` seconds since the marker was measured; as old as the table of expected errors goes
+    for one that never was."""
 
 
 class Redone(NamedTuple):

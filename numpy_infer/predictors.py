@@ -249,6 +249,9 @@ def none_step(
     return state, np.where(visible[..., None], markers, last)
 
 
+BASELINES = ("last_known", "moving_average", "affine")
+"""Predictors that need no training, so no model file."""
+
 PREDICTORS: dict[str, Predictor] = {
     "last_known": Predictor(last_known_init, last_known_step, uses_frame=False),
     "moving_average": Predictor(moving_average_init, moving_average_step, uses_frame=False),

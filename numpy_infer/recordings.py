@@ -49,7 +49,7 @@ class JointTruth:
         object.__setattr__(self, "names", tuple(self.names))
         object.__setattr__(self, "positions", np.asarray(self.positions, np.float64))
         object.__setattr__(self, "rotations", np.asarray(self.rotations, np.float64))
-        _check_unique(self.names, "joint")
+        _check_unique(self.names, "joint name")
         frames = self.positions.shape[0] if self.positions.ndim else 0
         _check_shape("positions", self.positions, (frames, len(self.names), 3))
         _check_shape("rotations", self.rotations, (frames, len(self.names), 3, 3))
@@ -99,7 +99,7 @@ class Recording:
         object.__setattr__(self, "markers", np.asarray(self.markers, np.float64))
         object.__setattr__(self, "time", np.asarray(self.time, np.float64))
         object.__setattr__(self, "rate", float(self.rate))
-        _check_unique(self.names, "marker")
+        _check_unique(self.names, "marker name")
         if self.time.ndim != 1 or not self.time.size or not self.names:
             raise ValueError(
                 "expected at least one frame and one marker, got time of shape "
@@ -194,7 +194,7 @@ def load_label_map(path: str | os.PathLike[str]) -> dict[str, str]:
     """Read {"label in the file": "our name"} from JSON; ValueError says what is wrong in it."""
 
     def pairs(items: list[tuple[str, object]]) -> dict[str, object]:
-        _check_unique([label for label, _ in items], f"{path}: label")
+        _check_unique([label for label, _ in items], "label", f"{path}: ")
         return dict(items)
 
     try:
@@ -206,7 +206,7 @@ def load_label_map(path: str | os.PathLike[str]) -> dict[str, str]:
     for label, name in mapping.items():
         if not isinstance(name, str):
             raise ValueError(f"{path}: {label!r}: expected a name, got {name!r}")
-    _check_unique(list(mapping.values()), f"{path}: name")
+    _check_unique(list(mapping.values()), "name", f"{path}: ")
     return mapping
 
 
@@ -290,11 +290,11 @@ def _without_prefix(label: str) -> str:
     return label.rpartition(":")[2].strip() or label
 
 
-def _check_unique(names: Sequence[str], what: str) -> None:
+def _check_unique(names: Sequence[str], what: str, where: str = "") -> None:
     seen = set()
     for name in names:
         if name in seen:
-            raise ValueError(f"duplicate {what} name {name!r}")
+            raise ValueError(f"{where}duplicate {what} {name!r}")
         seen.add(name)
 
 

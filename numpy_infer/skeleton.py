@@ -56,6 +56,8 @@ millimetre of noise can then turn a joint by 1.4 degrees, in the direction least
 THUMB_ANGLES = np.stack(EULER)[:, [angle.joint.startswith("thumb") for angle in ANGLES]]
 """`[2, 6]` which of the thumb's three joints each of its angles turns, and about which axis."""
 
+_THUMB_DAMPING = (THUMB_NOISE / THUMB_PRIOR) ** 2 * np.eye(THUMB_ANGLES.shape[1])
+
 
 def rotations_from_angles(angles: Array) -> Array:
     """`[..., 26]` radians, in the order of `hand.ANGLES` → `[..., 15, 3, 3]` parent_from_joint of
@@ -119,9 +121,9 @@ def forward_kinematics(
 def marker_positions(hand: Hand, positions: Array, rotations: Array) -> Array:
     """`[..., M, 3]` metres: the hand's markers on `positions [..., 21, 3]` and `rotations
     [..., 16, 3, 3]` as `forward_kinematics` gives them."""
-    offsets = hand.offsets.astype(positions.dtype)[..., None]
-    links = rotations[..., list(hand.links), :, :]
-    return positions[..., list(hand.joints), :] + (links @ offsets)[..., 0]
+    offsets = hand.offsets.astype(positions.dtype, copy=False)[..., None]
+    joints, links = hand.placing
+    return positions[..., joints, :] + (rotations[..., links, :, :] @ offsets)[..., 0]
 
 
 def flat_calibrated(rotations: Array, flat: Array) -> Array:
@@ -156,10 +158,10 @@ def align_fingers(
     Returns:
         `[..., 15, 3, 3]` parent_from_joint.
     """
-    ends = np.array([own[-1] if own else -1 for own in hand.finger_markers])
+    ends, has = hand.end_markers
     base = positions[..., 1:16:3, :]
     modelled = marker_positions(hand, positions, rotations)[..., ends, :] - base
-    share = weight[..., ends] * (ends >= 0).astype(weight.dtype)
+    share = weight[..., ends] * has.astype(weight.dtype)
     measured = np.where(share[..., None] > 0, markers[..., ends, :] - base, modelled)
     turn = shortest_arc(modelled, measured, share)
     wrist = rotations[..., :1, :, :]
@@ -188,11 +190,11 @@ def align_thumb(
     axes = rotations[..., 1:4, :, :] @ JOINT_AXES[:3].astype(local.dtype, copy=False)
     axes = axes.swapaxes(-1, -2)[..., THUMB_ANGLES[0], THUMB_ANGLES[1], :]
     arms = modelled[..., None, :, :] - positions[..., 1 + THUMB_ANGLES[0], None, :]
-    carried = np.array(hand.links)[own] > THUMB_ANGLES[0][:, None]
+    carried = hand.placing[1][own] > THUMB_ANGLES[0][:, None]
     reach = pull[..., None, :, :] * carried[..., None].astype(local.dtype)
     slopes = cross(axes[..., None, :], arms) * reach
     slopes = slopes.reshape(*slopes.shape[:-2], -1)
-    damping = (THUMB_NOISE / THUMB_PRIOR) ** 2 * np.eye(len(THUMB_ANGLES[0]), dtype=local.dtype)
+    damping = _THUMB_DAMPING.astype(local.dtype, copy=False)
     gradient = (slopes @ off.reshape(*off.shape[:-2], -1, 1))[..., 0]
     bend = solve(slopes @ slopes.swapaxes(-1, -2) + damping, gradient)
     vectors = np.zeros((*bend.shape[:-1], 3, 3), local.dtype)

@@ -102,7 +102,7 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         correction=np.zeros_like(template),
         anchor=template,
         prior=eye,
-        age=np.zeros((*batch, count), dtype),
+        age=np.full((*batch, count), ERROR_AGES[-1], dtype),
     )
 
 
@@ -390,7 +390,7 @@ def _expected_error(model: Model, visible: Array, age: Array) -> Array:
     if visible.all():
         return np.zeros_like(age)
     table = model.expected_error.astype(age.dtype, copy=False)
-    row = table[np.clip((~visible).sum(-1), 1, len(table)) - 1][..., None, :]
+    row = table[np.minimum(np.maximum((~visible).sum(-1), 1), len(table)) - 1][..., None, :]
     share = (age[..., None] - _AGES[:-1].astype(age.dtype, copy=False)) / _AGE_STEPS
     share = np.minimum(np.maximum(share, 0), 1).astype(age.dtype, copy=False)
     error = row[..., 0] + ((row[..., 1:] - row[..., :-1]) * share).sum(-1)

@@ -28,6 +28,8 @@ class Tracked:
     """`[T, M]` metres."""
     state: Array
     """`[T]` a `TrackingState` for each frame."""
+    notice: Array
+    """`[T]` flags of `Notice`."""
 
 
 def track(
@@ -57,11 +59,12 @@ def track(
     status = np.full(recording.markers.shape[:2], int(Status.HELD))
     expected_error = np.zeros(status.shape)
     state = np.full(frames, int(TrackingState.LOST))
+    notice = np.zeros(frames, int)
     begun = False
     for i in range(frames):
         pose = tracker.step(recording.markers[i], steps[i])
         begun = begun or pose.state == TrackingState.TRACKING
-        status[i], state[i] = pose.status, pose.state
+        status[i], state[i], notice[i] = pose.status, pose.state, pose.notice
         if begun:
             markers[i], expected_error[i] = pose.markers, pose.expected_error
             if pose.angles is not None:
@@ -78,4 +81,4 @@ def track(
         joints=None,
         filled=recording.names,
     )
-    return Tracked(filled, status, expected_error, state)
+    return Tracked(filled, status, expected_error, state, notice)

@@ -18,6 +18,7 @@ from jaxhand.datasets import (
     SOURCES,
     Dataset,
     Sequence,
+    _without_side,
     complete_frames,
     load,
     parse_spec,
@@ -70,7 +71,7 @@ def test_a_missing_path_says_what_to_pass(name: str, tmp_path: Path) -> None:
 
 def test_an_unknown_take_is_named_beside_those_there_are(tmp_path: Path) -> None:
     write_takes(tmp_path, ["a", "b"])
-    with pytest.raises(ValueError, match=r"no take c; pass takes out of: a, b"):
+    with pytest.raises(ValueError, match=r"no take c; name takes with --test, out of: a, b"):
         load(f"recordings:{tmp_path}", "test", takes=("a", "c"))
 
 
@@ -78,7 +79,7 @@ def test_only_the_split_asked_for_must_be_there(tmp_path: Path) -> None:
     folder = tmp_path / "User4" / "capture1"
     write_takes(folder, ["sequence.1_training_dense_left"])
     assert len(load(f"sig18:{tmp_path}", "test").sequences) == 1
-    with pytest.raises(ValueError, match="no take User1, User2; pass takes out of: User4"):
+    with pytest.raises(ValueError, match="no take User1, User2; name takes with --train"):
         load(f"sig18:{tmp_path}", "train")
 
 
@@ -171,6 +172,24 @@ def test_a_mirrored_right_hand_is_the_left_hand(tmp_path: Path) -> None:
     np.testing.assert_allclose(left.markers, simulated(121)[0][::2], atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("stem", "take", "side"),
+    [
+        ("cube_med2_leftHand", "cube_med2", "left"),
+        ("sequence.35_training_dense_right", "sequence.35_training_dense", "right"),
+        ("takeRight01", "take01", "right"),
+        ("LEFT-walk", "-walk", "left"),
+        ("rightHand", "", "right"),
+        ("bright_take", "bright_take", "left"),
+        ("upright", "upright", "left"),
+        ("Righteous", "Righteous", "left"),
+        ("take1", "take1", "left"),
+    ],
+)
+def test_a_files_name_tells_its_side(stem: str, take: str, side: str) -> None:
+    assert _without_side(stem) == (take, side)
+
+
 def test_both_hands_of_a_take_fall_into_one_split(tmp_path: Path) -> None:
     write_takes(tmp_path, [f"{take}_{side}" for take in "abcde" for side in ("left", "right")])
     found = {
@@ -235,7 +254,7 @@ def test_qualisys_is_a_right_hand_and_all_of_it_is_test(tmp_path: Path) -> None:
     np.testing.assert_allclose(sequence.markers[0], hand.template, atol=1e-6)
     # 100 → 60 Hz: frame 4 lies beside the samples at 3.33 and at 5.0 is not.
     np.testing.assert_array_equal(np.isfinite(sequence.markers[:, 2, 0]), [1, 1, 0, 1, 1, 1, 1])
-    with pytest.raises(ValueError, match="no default 'train' split; pass takes out of: recording"):
+    with pytest.raises(ValueError, match=r"no default 'train' split; .*out of: recording"):
         load(f"qualisys:{tmp_path}", "train")
     load(f"qualisys:{tmp_path}", "train", takes=("recording",))
 

@@ -280,8 +280,8 @@ def test_a_label_map_is_read_from_json(tmp_path: Path) -> None:
         ('{"a": "b",\n}', r"map\.json:2: not JSON"),
         ('["a"]', "expected an object"),
         ('{"a": 1}', "'a': expected a name, got 1"),
-        ('{"a": "b", "a": "c"}', "duplicate .*label name 'a'"),
-        ('{"a": "c", "b": "c"}', "duplicate .*name name 'c'"),
+        ('{"a": "b", "a": "c"}', "duplicate label 'a'"),
+        ('{"a": "c", "b": "c"}', "duplicate name 'c'"),
     ],
 )
 def test_a_broken_label_map_is_refused(text: str, message: str, tmp_path: Path) -> None:
