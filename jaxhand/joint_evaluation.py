@@ -54,10 +54,10 @@ def rows(
 ) -> dict[str, Row]:
     """The methods of Table 4 for a model, all with the data set's own bones but one.
 
-    `learned` is the pipeline, `learned_uncalibrated` the same on the bones of the bundled hand, as
-    somebody has it who never calibrates; `ik` and `ik_tuned` are the paper's rival on the same
-    filled markers, and `least_squares` the likeliest posture, with the prior that the model's
-    training left behind.
+    `learned` is the pipeline with finger alignment, `learned_uncalibrated` the same on the bones of
+    the bundled hand, as somebody has it who never calibrates; `ik` and `ik_tuned` are the paper's
+    rival on the same filled markers, and `least_squares` the likeliest posture, with the prior that
+    the model's training left behind.
 
     Args:
         model: with both networks.
@@ -65,7 +65,7 @@ def rows(
         others: further models by the name of their row.
     """
     wearer = model.hand.with_skeleton(dataset.hand.skeleton)
-    learned = replace(model, predictor="learned", joints="learned")
+    learned = replace(model, predictor="learned", joints="learned", alignment=True)
     filled = replace(learned, joints="none")
     found = {
         "ik": Row(filled, partial(_descend, wearer, tuned=False)),
@@ -80,7 +80,8 @@ def rows(
         average = model.hand.with_skeleton(load_hand(model.hand.name).skeleton)
         found["learned_uncalibrated"] = Row(replace(learned, wearer=average))
     for name, other in (others or {}).items():
-        found[name] = Row(replace(other, wearer=other.hand.with_skeleton(dataset.hand.skeleton)))
+        own = other.hand.with_skeleton(dataset.hand.skeleton)
+        found[name] = Row(replace(other, alignment=True, wearer=own))
     return found
 
 
@@ -229,7 +230,7 @@ def joint_errors(model: Model, dataset: data.Dataset) -> dict[str, dict[str, Cel
 
 def evaluate_poses(model: Model, markers: Array) -> HandPose:
     """The tracker's output on complete frames `[N, M, 3]`, each as a first frame."""
-    model = replace(model, predictor="affine", joints="learned")
+    model = replace(model, predictor="affine", joints="learned")  # alignment as the model has it
     chunks, size = evaluation.chunked(len(markers))
     state = tracker.init(model, (size,))
     visible, dt = jnp.ones((size, len(model.hand)), bool), jnp.zeros(size)

@@ -43,7 +43,8 @@ def joint_stage(model: Model, markers: Array, rotation: Array, position: Array) 
     own = untransform(rotation, position, markers)
     features = own if model.wearer is None else _as_trained(model, own)
     features = features.reshape(*features.shape[:-2], -1)
-    local = rotations_from_angles(predict(network, features, jnp.ones(features.shape, bool)))
+    angles = predict(network, features, jnp.ones(features.shape, bool))
+    local = rotations_from_angles(angles)
     if model.flat is not None:
         local = flat_calibrated(local, jnp.asarray(model.flat, local.dtype))
     skeleton = jnp.asarray(model.body.skeleton, markers.dtype)
@@ -54,8 +55,10 @@ def joint_stage(model: Model, markers: Array, rotation: Array, position: Array) 
             placed = forward_kinematics(skeleton, local, *still)
             local = align(model.body, local, *placed, own, jnp.ones_like(own[..., 0]))
     positions, rotations = forward_kinematics(skeleton, local, rotation, position)
+    if model.flat is not None or model.alignment:
+        angles = angles_from_rotations(local)
     return {
-        "angles": angles_from_rotations(local),
+        "angles": angles,
         "rotations": rotations,
         "positions": positions,
     }

@@ -99,6 +99,9 @@ def parser() -> argparse.ArgumentParser:
     tracked.add_argument(
         "--calibration", type=Path, metavar="ME", help="the wearer's file from jaxhand calibrate"
     )
+    tracked.add_argument(
+        "--no-alignment", action="store_true", help="do not turn fingers towards their markers"
+    )
     tracked.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     tracked.set_defaults(run=_track)
 
@@ -198,6 +201,7 @@ def _track(options: argparse.Namespace) -> None:
         model = replace(model, predictor=options.predictor)
     if options.joints:
         model = replace(model, joints=options.joints)
+    model = replace(model, alignment=not options.no_alignment)
     if options.calibration:
         model = wearer.calibrated(model, wearer.load(options.calibration))
     show = sys.stderr.isatty()

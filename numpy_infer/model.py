@@ -53,8 +53,9 @@ class Model:
     """`[3M]` registered markers, metres → the same; needed by the predictor `learned`."""
     joint_network: Network | None = None
     """`[3M]` markers in the hand frame, metres → `[26]` radians; needed by the stage `learned`."""
-    alignment: bool = True
-    """Turn the fingers towards their markers after the joint network, see `skeleton`."""
+    alignment: bool = False
+    """Turn the fingers towards their markers after the joint network, see `skeleton`: nearer joints
+    for half as much time again, so a choice of whoever runs the model, not of its file."""
     wearer: Hand | None = None
     """The same markers on the bones of whoever wears the glove: what joints and wrist pose are made
     with; None stands for `hand`. Comes from a calibration, not from the model file."""
@@ -119,7 +120,6 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
         "predictor": model.predictor,
         "joints": model.joints,
         "networks": networks,
-        "alignment": bool(model.alignment),
         "fade": float(model.fade),
         "continuity": bool(model.continuity),
         "training": dict(model.training),
@@ -183,7 +183,7 @@ def _read(archive: zipfile.ZipFile) -> Model:
             f"written in version {header.get('version')!r}, this program reads version {VERSION}"
         )
     expected = {"format", "version", "hand", "predictor", "joints", "networks", "fade"}
-    expected |= {"alignment", "continuity", "training", "checksum"}
+    expected |= {"continuity", "training", "checksum"}
     if set(header) != expected or not isinstance(header["networks"], dict):
         raise ValueError(f"damaged header: expected {sorted(expected)}, found {sorted(header)}")
     for name in sorted(set(header["networks"]) - {"marker_network", "joint_network"}):
@@ -217,7 +217,6 @@ def _read(archive: zipfile.ZipFile) -> Model:
         hand=hand,
         predictor=header["predictor"],
         joints=header["joints"],
-        alignment=header["alignment"],
         fade=header["fade"],
         continuity=header["continuity"],
         expected_error=arrays["expected_error"],
@@ -228,7 +227,7 @@ def _read(archive: zipfile.ZipFile) -> Model:
 
 def _check_header(header: Mapping[str, Any]) -> None:
     kinds: dict[str, type] = {"predictor": str, "joints": str, "fade": float, "training": dict}
-    kinds |= {"alignment": bool, "continuity": bool}
+    kinds["continuity"] = bool
     for key, kind in kinds.items():
         if not isinstance(header[key], kind):
             raise ValueError(f"header: expected {key!r} as {kind.__name__}, found {header[key]!r}")

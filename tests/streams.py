@@ -91,7 +91,7 @@ def a_model(
         joints="learned" if joints else "none",
         marker_network=marker_network if predictor == "learned" else None,
         joint_network=joint_network if joints else None,
-        **changes,
+        **{"alignment": joints, **changes},  # the longest pipeline
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import functools
 import pickle
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -583,7 +584,8 @@ def test_a_saved_model_tracks_alike_bit_for_bit(predictor: str, tmp_path: Path) 
     rng = np.random.default_rng(1)
     truth = motion(model.hand, rng, 20, 2)
     stream = Stream(truth, blocks(rng, truth.shape[:-1]), np.full((20, 2), 1 / 60))
-    assert_same_bits(run(load(tmp_path / "m.npz"), stream), run(model, stream))
+    back = replace(load(tmp_path / "m.npz"), alignment=model.alignment)  # whoever runs it chooses
+    assert_same_bits(run(back, stream), run(model, stream))
 
 
 # -- the live object ----------------------------------------------------------------------------
