@@ -9,7 +9,9 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 # Before numpy and JAX are loaded: one thread, as an app that tracks beside its own work has it.
@@ -85,8 +87,8 @@ def print_tracking(model: Model, rounds: int) -> None:
     streams = simulation.streams(jax.random.key(2), hand, 1, rounds + 1)
     markers = np.array(streams.markers[0], np.float64)
     markers[1:, 4] = np.nan
-    tracker = HandTracker(model)
-    frames = iter(markers)
+    trackers = (HandTracker(replace(model, alignment=on)) for on in (False, True))
+    plain, aligned = ((tracker, iter(markers)) for tracker in trackers)
     inputs, every = np.zeros(3 * len(hand), np.float32), np.ones(3 * len(hand), bool)
 
     def networks() -> None:
@@ -94,10 +96,17 @@ def print_tracking(model: Model, rounds: int) -> None:
             assert network is not None
             predict(network, inputs, every)
 
-    step = lambda: tracker.step(next(frames), 1 / 60)  # noqa: E731
-    taken = interleaved({"step": step, "networks": networks}, rounds)
+    def step(tracker: HandTracker, frames: Iterator[Array]) -> None:
+        tracker.step(next(frames), 1 / 60)
+
+    runs = {"step": partial(step, *plain), "aligned": partial(step, *aligned), "networks": networks}
+    taken = interleaved(runs, rounds)
     print("\nnumpy, one hand, one marker hidden, µs a frame")
-    for name, text in (("step", "HandTracker.step"), ("networks", "its two networks alone")):
+    for name, text in (
+        ("step", "HandTracker.step"),
+        ("aligned", "with finger alignment"),
+        ("networks", "its two networks alone"),
+    ):
         seconds = 1e6 * taken[name]
         print(f"  {text:28} {spread(seconds, 0)}, 99 % {np.quantile(seconds, 0.99):.0f}")
     print(f"  {'ratio':28} {spread(taken['step'] / taken['networks'])}")
