@@ -509,6 +509,8 @@ class HandTracker:
         shown = np.ones(expected[:-1], bool) if visible is None else np.asarray(visible, bool)
         if shown.shape != expected[:-1]:
             raise ValueError(f"visible: expected shape {expected[:-1]}, received {shown.shape}")
-        elapsed = np.broadcast_to(np.asarray(dt, np.float64), self._right.shape)
+        elapsed = np.asarray(dt, np.float64)
+        if elapsed.shape != self._right.shape:
+            elapsed = np.broadcast_to(elapsed, self._right.shape)
         self._state, pose = step(self.model, self._state, markers, shown, elapsed)
         return pose
