@@ -291,6 +291,8 @@ def _joint_errors(
     hidden = evaluation.hide(rng, len(starts.start), len(row.model.hand), count)
     trials, block = evaluation.run_trials(row.model, state, starts, hidden, duration)
     found = trials.pose.positions
+    if not len(block):
+        return np.zeros(0), block
     if row.solve is not None:
         # As many each time: another number would compile anew.
         size = len(state.tracked)

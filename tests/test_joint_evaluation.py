@@ -1,0 +1,132 @@
+"""Laws of Table 4 and of what stands beside it, on simulated hands with joint truth."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+jax = pytest.importorskip("jax")
+
+from streams import a_model  # noqa: E402
+
+from jaxhand import joint_evaluation as evaluation  # noqa: E402
+from jaxhand import report, simulation  # noqa: E402
+from jaxhand.joint_evaluation import Row  # noqa: E402
+from jaxhand.sequences import Dataset, Sequence  # noqa: E402
+from jaxhand.skeleton import forward_kinematics, rotations_from_angles  # noqa: E402
+from jaxhand.sparse_fit import prior_of  # noqa: E402
+from numpy_infer import load_hand  # noqa: E402
+from numpy_infer.arrays import Array  # noqa: E402
+
+GLOVE = load_hand("glove9")
+FRAMES, LARGER = 70, 1.1
+
+
+@pytest.fixture(scope="module")
+def dataset() -> Dataset:
+    """Two hands of a person 10 % larger than the bundled one."""
+    hand = GLOVE.with_skeleton(LARGER * GLOVE.skeleton)
+    move = simulation.motion(jax.random.key(0), FRAMES, 60.0, (2,))
+    skeleton = np.float32(hand.skeleton)
+    positions, rotations = forward_kinematics(
+        skeleton, rotations_from_angles(move.angles), move.wrist_rotation, move.wrist_position
+    )
+    markers = simulation.markers(
+        hand, skeleton, move.angles, move.wrist_rotation, move.wrist_position
+    )
+    arrays = zip(*map(np.asarray, (markers, positions, rotations, move.angles)), strict=True)
+    sequences = tuple(Sequence(f"take/{i}", "take", 60.0, *parts) for i, parts in enumerate(arrays))
+    return Dataset("simulated", hand, sequences)
+
+
+def with_posture(dataset: Dataset) -> object:
+    model = a_model("learned", dtype=np.float32, joints=True, alignment=False)
+    angles = np.concatenate([s.angles for s in dataset.sequences])
+    posture = {k: v.tolist() for k, v in prior_of(angles)._asdict().items()}
+    return replace(model, training={"posture": posture})
+
+
+def test_rows_stand_on_the_data_sets_bones_but_the_uncalibrated_one(dataset: Dataset) -> None:
+    rows = evaluation.rows(with_posture(dataset), dataset, {"learned_paper": with_posture(dataset)})
+    assert list(rows) == [
+        *("ik", "ik_tuned", "least_squares"),
+        *("learned", "learned_uncalibrated", "learned_paper"),
+    ]
+    for name, row in rows.items():
+        bones = GLOVE.skeleton if name == "learned_uncalibrated" else dataset.hand.skeleton
+        if row.solve is None:
+            np.testing.assert_array_equal(row.model.body.skeleton, bones)
+            assert row.model.alignment
+    plain = a_model("learned", joints=True)
+    assert "least_squares" not in evaluation.rows(plain, dataset)
+
+
+def test_what_solves_exactly_has_no_error_and_what_errs_has_its_own(dataset: Dataset) -> None:
+    truth = np.concatenate([s.positions for s in dataset.sequences])
+    frames = np.concatenate([s.markers for s in dataset.sequences])
+
+    def known(markers: Array) -> Array:
+        """The truth of the frame whose visible markers these are, 1 cm off."""
+        near = np.abs(markers[:, None] - frames).sum(-1)
+        frame = np.median(near, -1).argmin(-1)
+        return truth[frame] + np.array([0.01, 0, 0])
+
+    model = replace(a_model("affine", dtype=np.float32), joints="none")
+    table = evaluation.table4({"off": Row(model, known)}, dataset, seeds=1)["off"]
+    assert set(table) == {"0", "1", "2", "3", "4"}
+    assert table["0"]["mean"] == pytest.approx(1.0, abs=1e-4)
+    assert table["1"]["0.1"]["mean"] == pytest.approx(1.0, abs=1e-4)
+    assert table["1"]["2.0"]["n"] == 0
+    starts = 2 * (FRAMES - 19 - 6)
+    assert table["0"]["n"] == -(-starts // evaluation.SOLVED_EVERY)
+    json.dumps(table)
+
+
+def test_the_wrist_is_exact_with_nothing_hidden_and_worse_the_more_is(dataset: Dataset) -> None:
+    model = replace(a_model("affine", dtype=np.float32), wearer=dataset.hand)
+    errors = evaluation.wrist_errors(model, dataset, seeds=1)
+    assert set(errors) == {"0", "1", "2", "3"}
+    assert errors["0"]["mm"]["mean"] < 0.01
+    assert errors["0"]["deg"]["mean"] < 0.01
+    assert errors["3"]["mm"]["mean"] > errors["1"]["mm"]["mean"] > 0
+
+
+def test_angles_between_rotations_are_right_near_none_and_near_half_a_turn() -> None:
+    def about_x(degrees: float) -> Array:
+        angle = np.radians(degrees)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+
+    for degrees in (0, 1e-4, 0.01, 10, 179.9):
+        found = evaluation._degrees(about_x(30), about_x(30 + degrees))
+        assert found == pytest.approx(degrees, abs=1e-6)
+
+
+def test_steadiness_and_tip_distances_are_of_the_output(dataset: Dataset) -> None:
+    model = replace(with_posture(dataset), wearer=dataset.hand)
+    quiet = evaluation.steadiness(model, dataset)
+    own = [evaluation._third(s.positions) for s in dataset.sequences]
+    assert quiet["jitter_of_truth"] == pytest.approx(np.mean(own))
+    assert quiet["still"] > 0.1
+    cell = evaluation.tip_distance_errors(model, dataset)
+    assert cell["n"] >= 0
+
+
+def test_without_joint_truth_there_is_no_table(dataset: Dataset) -> None:
+    bare = replace(dataset, sequences=tuple(replace(s, positions=None) for s in dataset.sequences))
+    model = replace(a_model("affine", dtype=np.float32), joints="none")
+    with pytest.raises(ValueError, match="no joint truth"):
+        evaluation.table4({"any": Row(model, lambda m: m)}, bare)
+
+
+def test_the_printed_table_holds_the_figures() -> None:
+    from rich.console import Console
+
+    cell = {"mean": 0.123, "low": 0.1, "high": 0.2, "n": 9}
+    row = {"0": cell, **{k: {f"{d:.1f}": cell for d in report.DURATIONS} for k in "1234"}}
+    console = Console(width=80, record=True)
+    report.print_table4({"learned": row}, console)
+    assert console.export_text().count("0.12 ±0.05") == 21
