@@ -14,27 +14,26 @@ from dataclasses import dataclass, fields, replace
 from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-import tyro
 from rich.console import Console
 
 from jaxhand import runs, simulation
 from jaxhand.datasets import Split, load
 from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
-from jaxhand.options import DataSets, Takes
+from jaxhand.options import DataSets, Layers, Takes
 from jaxhand.sequences import Dataset, complete_frames
 from jaxhand.sparse_fit import prior_of
 from jaxhand.tasks import Augmentation, Frames, Task, joint_task, marker_task, mean_square
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, Hand, load_hand
 from numpy_infer.model import Model
-from numpy_infer.networks import Dense, Dropout, Spec, read_spec, write_spec
+from numpy_infer.networks import Dense, Dropout, Spec, write_spec
 
 ADAM = optax.scale_by_adam()
 
@@ -50,48 +49,6 @@ PAPER_JOINTS: dict[str, Any] = {
 """The paper's joint network (sections 3.3 and 3.4) as fields of `TrainingConfig`."""
 
 Report = Callable[["Metrics"], None]
-
-
-def read_layers(text: str) -> Spec:
-    """Hidden layers from `200,0.1,150`: a whole number is that many ReLU units, a part of 1 a
-    dropout; or from a JSON file with a list of layers as `numpy_infer.networks.read_spec` has it.
-
-    Raises:
-        ValueError: neither; the message names the layer.
-    """
-    if text.endswith(".json"):
-        layers = json.loads(Path(text).read_text("utf-8"))
-    else:
-        layers = [_read_layer(part) for part in text.split(",")]
-    return read_spec([*layers, {"type": "dense", "units": 1, "activation": "linear"}])[:-1]
-
-
-def _read_layer(text: str) -> dict[str, Any]:
-    try:
-        number = float(text)
-    except ValueError:
-        raise ValueError(
-            f"layer {text!r}: expected units such as 200, a dropout such as 0.1, or a .json file"
-        ) from None
-    if 0 < number < 1:
-        return {"type": "dropout", "rate": number}
-    return {"type": "dense", "units": int(number) if number.is_integer() else number}
-
-
-def _write_layers(spec: Spec) -> list[str]:
-    return [",".join(str(x.units if isinstance(x, Dense) else x.rate) for x in spec)]
-
-
-Layers = Annotated[
-    Spec,
-    tyro.constructors.PrimitiveConstructorSpec(
-        nargs=1,
-        metavar="LAYERS",
-        instance_from_str=lambda arguments: read_layers(arguments[0]),
-        is_instance=lambda value: isinstance(value, tuple),
-        str_from_instance=_write_layers,
-    ),
-]
 
 
 @dataclass(frozen=True)

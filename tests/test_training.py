@@ -15,7 +15,7 @@ pytest.importorskip("tyro")
 
 from strategies import HIGH, LOW, turn  # noqa: E402
 
-from jaxhand import cli, runs, tasks, training  # noqa: E402
+from jaxhand import cli, options, runs, tasks, training  # noqa: E402
 from jaxhand.networks import predict  # noqa: E402
 from jaxhand.sequences import Dataset, Sequence  # noqa: E402
 from jaxhand.skeleton import (  # noqa: E402
@@ -443,13 +443,13 @@ def test_senseless_frames_are_refused() -> None:
 
 
 def test_layers_are_read_from_text_and_file(tmp_path: Path) -> None:
-    assert training.read_layers("200,0.1,150") == (Dense(200), Dropout(0.1), Dense(150))
+    assert options.read_layers("200,0.1,150") == (Dense(200), Dropout(0.1), Dense(150))
     file = tmp_path / "layers.json"
     file.write_text('[{"type": "dense", "units": 8, "activation": "linear"}]')
-    assert training.read_layers(str(file)) == (Dense(8, "linear"),)
+    assert options.read_layers(str(file)) == (Dense(8, "linear"),)
     for wrong in ("200,x", "0", "1.5", "", "-3"):
         with pytest.raises(ValueError, match="layer"):
-            training.read_layers(wrong)
+            options.read_layers(wrong)
 
 
 def plain(**options: Any) -> dict[str, Any]:
