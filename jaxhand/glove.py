@@ -24,8 +24,8 @@ from numpy_infer.wearer import Wearer
 
 SPARSE_PRIORS, SPARSE_NOISE = Priors(bone=0.003, offset=0.5e-3), 1e-3
 """For a glove of fewer than `DENSE` markers. They cannot tell a long bone from a bent joint, only
-how large the hand is: with bones left free, joints came out worse on every hand tried, with these
-they never did."""
+how large the hand is: with bones left free, joints came out worse on each of eight simulated
+people. What these are worth `experiments/person.py` tells, on people they were not chosen on."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -119,6 +119,7 @@ def test_curves_of_table_4_begin_at_nothing_hidden(tmp_path: Path) -> None:
         rows["0"] = {"mean": 0.5, "low": 0.4, "high": 0.6, "n": 9}
     pictures.table_picture(joints, tmp_path / "t4.svg")
     text = (tmp_path / "t4.svg").read_text("utf-8")
+    assert "<!-- 1 marker hidden -->" in text  # matplotlib notes every text beside its outlines
     assert "0 marker" not in text
     assert is_png_of(joints, tmp_path / "t4.png")
 
