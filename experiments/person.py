@@ -1,24 +1,24 @@
 """What a calibration is worth: `python experiments/person.py demo/model.npz`.
 
 Simulated people in the model's glove, each with bones of their own. Twenty seconds of free motion
-calibrate, the ten after them are measured: mean error of the joints through the whole pipeline on
-the model's bones, on the calibrated ones, and on the true ones.
+calibrate, the ten after them are measured: mean error of the joints through the whole pipeline for
+the model's hand, for one of the size found, and on the true bones.
 """
 
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
 import jax
 import numpy as np
 
 from jaxhand import simulation
-from jaxhand.glove import calibrated_hand
+from jaxhand.hand_size import hand_size
 from jaxhand.joint_evaluation import POINTS, evaluate_poses
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
 from numpy_infer.model import Model, load
+from numpy_infer.wearer import worn_by
 
 RATE, SECONDS, CALIBRATED = 60.0, 30, 20
 NOISE = 0.5e-3
@@ -29,7 +29,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("model", help="a model with a joint network")
     parser.add_argument("--people", type=int, default=8)
-    parser.add_argument("--seed", type=int, default=1, help="the priors were chosen on 99")
+    parser.add_argument("--seed", type=int, default=1, help="the method was chosen on 99")
     options = parser.parse_args()
     model = load(options.model)
     frames, split = round(RATE * SECONDS), round(RATE * CALIBRATED)
@@ -40,7 +40,7 @@ def main() -> None:
     rows = []
     for person in range(options.people):
         true = model.hand.with_skeleton(np.asarray(streams.skeleton[person]))
-        found = calibrated_hand(model.hand, markers[person, :split], RATE).hand
+        found = model.hand.resized(hand_size(model, markers[person, :split]).factor)
         truth = np.asarray(streams.positions[person, split:])
         rows.append(
             [error(model, on, markers[person, split:], truth) for on in (model.hand, found, true)]
@@ -48,12 +48,14 @@ def main() -> None:
         print(f"person {person}: {rows[-1][0]:.2f} → {rows[-1][1]:.2f} cm", flush=True)
     before, after, best = np.mean(rows, 0)
     worse = sum(row[1] > row[0] for row in rows)
-    print(f"joints, cm: {before:.3f} on the model's bones, {after:.3f} calibrated, {best:.3f} on")
-    print(f"the true ones; {worse} of {len(rows)} people are worse off")
+    print(
+        f"joints, cm: {before:.3f} uncalibrated, {after:.3f} calibrated, {best:.3f} on true bones;"
+    )
+    print(f"bones; {worse} of {len(rows)} people are worse off")
 
 
-def error(model: Model, wearer: Hand, markers: Array, truth: Array) -> float:
-    poses = evaluate_poses(replace(model, wearer=wearer), markers.astype(np.float32))
+def error(model: Model, hand: Hand, markers: Array, truth: Array) -> float:
+    poses = evaluate_poses(worn_by(model, hand), markers.astype(np.float32))
     return float(1e2 * np.linalg.norm(poses.positions - truth, axis=-1)[:, POINTS].mean())
 
 

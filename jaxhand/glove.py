@@ -11,7 +11,8 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from jaxhand.calibration import DENSE, Calibration, Priors, calibrate, new_hand
+from jaxhand.calibration import DENSE, Calibration, calibrate, new_hand
+from jaxhand.hand_size import Size, hand_size
 from jaxhand.joint_evaluation import evaluate_poses
 from numpy_infer import wearer
 from numpy_infer.arrays import Array
@@ -21,11 +22,6 @@ from numpy_infer.model import Model
 from numpy_infer.model import load as load_model
 from numpy_infer.recordings import Recording, load_label_map, read
 from numpy_infer.wearer import Wearer
-
-SPARSE_PRIORS, SPARSE_NOISE = Priors(bone=0.003, offset=0.5e-3), 1e-3
-"""For a glove of fewer than `DENSE` markers. They cannot tell a long bone from a bent joint, only
-how large the hand is: with bones left free, joints came out worse on each of eight simulated
-people. What these are worth `experiments/person.py` tells, on people they were not chosen on."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +65,7 @@ class HandConfig(_File):
 
 def calibrate_person(config: CalibrateConfig, console: Console | None = None) -> Wearer:
     """Finds the bones of whoever wears a glove out of 5 to 30 s of free motion, and writes them.
+    A glove of many markers gives every bone, one of few the hand's size.
 
     Raises:
         ValueError: a file that is none or exists already, or a recording that does not determine a
@@ -78,31 +75,25 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
     recording, model = _read(config), load_model(config.model)
     markers = _markers(recording, model.hand.markers, config.right)
     flat = None if config.flat is None else _flat(model, recording, markers, config.flat)
-    with console.status("fitting bones, angles and poses"):
-        found = calibrated_hand(model.hand, markers, recording.rate)
-    unseen = tuple(finger for finger, seen in zip(FINGERS, found.seen, strict=True) if not seen)
-    person = Wearer(found.hand, flat, unseen)
+    with console.status("fitting the hand"):
+        if len(model.hand) >= DENSE:
+            found = calibrate(model.hand, markers, rate=recording.rate)
+            hand, seen, said = found.hand, found.seen, _bones(found, model.hand)
+        else:
+            size = hand_size(model, markers)
+            hand, seen, said = model.hand.resized(size.factor), size.seen, _of_size(size)
+    unseen = tuple(finger for finger, known in zip(FINGERS, seen, strict=True) if not known)
+    person = Wearer(hand, flat, unseen)
     wearer.save(person, config.out, overwrite=config.overwrite)
-    _tell(found, model, unseen, console)
+    for line in said:
+        console.print(line)
+    for finger in unseen:
+        console.print(f"not seen yet: the {finger}; bend and stretch it for a better fit")
     console.print(
         f"wrote {config.out}; HandTracker.load(…, calibration=…) and jaxhand track "
         "--calibration take it"
     )
     return person
-
-
-def calibrated_hand(hand: Hand, markers: Array, rate: float) -> Calibration:
-    """The fit behind `jaxhand calibrate`: bones and marker places of a dense glove, of a sparse one
-    hardly more than the size.
-
-    Args:
-        hand: the model's.
-        markers: `[T, M, 3]` metres, of a canonical left hand; NaN where hidden.
-        rate: frames per second.
-    """
-    if len(hand) >= DENSE:
-        return calibrate(hand, markers, rate=rate)
-    return calibrate(hand, markers, rate=rate, priors=SPARSE_PRIORS, noise=SPARSE_NOISE)
 
 
 def describe_glove(config: HandConfig, console: Console | None = None) -> None:
@@ -165,13 +156,24 @@ def _flat(
     return angles.mean(0)
 
 
-def _tell(found: Calibration, model: Model, unseen: tuple[str, ...], console: Console) -> None:
-    lengths = (np.linalg.norm(hand.skeleton, axis=-1)[1:] for hand in (found.hand, model.hand))
-    now, before = lengths
+def _bones(found: Calibration, model: Hand) -> list[str]:
+    """What is said of a fit of all bones."""
+    now, before = (np.linalg.norm(hand.skeleton, axis=-1)[1:] for hand in (found.hand, model))
     off = 1e3 * np.nanmean(found.residual)
-    console.print(f"{len(found.tracked)} frames; markers fit within {off:.1f} mm on average")
-    console.print(f"bones are {100 * (now.sum() / before.sum() - 1):+.1f} % of the model's in all")
-    for point, new, old in zip(POINTS[1:], now, before, strict=True):
-        console.print(f"  {point:11} {1e3 * new:5.1f} mm ({1e3 * (new - old):+.1f})")
-    for finger in unseen:
-        console.print(f"not seen yet: the {finger}; bend and stretch it for a better fit")
+    return [
+        f"{len(found.tracked)} frames; markers fit within {off:.1f} mm on average",
+        f"bones are {100 * (now.sum() / before.sum() - 1):+.1f} % of the model's in all",
+        *(
+            f"  {point:11} {1e3 * new:5.1f} mm ({1e3 * (new - old):+.1f})"
+            for point, new, old in zip(POINTS[1:], now, before, strict=True)
+        ),
+    ]
+
+
+def _of_size(size: Size) -> list[str]:
+    """What is said of a hand's size."""
+    low, high = (100 * (end - 1) for end in size.interval)
+    text = f"{100 * (size.likeliest - 1):+.1f} % of the model's (95 %: {low:+.1f} to {high:+.1f})"
+    if size.factor == 1:
+        text += ": too little to tell from the model's own, which is kept"
+    return [f"the hand is {text}", f"markers fit within {1e3 * size.off:.1f} mm, root mean square"]

@@ -181,6 +181,11 @@ class Hand:
         """`[M]` each: `joints` and `links` as arrays."""
         return np.array(self.joints), np.array(self.links)
 
+    @cached_property
+    def size(self) -> float:
+        """Metres: all bones together."""
+        return float(np.linalg.norm(self.skeleton, axis=-1).sum())
+
     @property
     def bone_lengths(self) -> dict[str, float]:
         """Metres from each point's parent to it, without the wrist."""
@@ -196,6 +201,11 @@ class Hand:
         _check_finite(self.name, {p: skeleton[i] for i, p in enumerate(POINTS)})
         template = flat_points(skeleton)[list(self.joints)] + self.offsets
         return replace(self, skeleton=skeleton, template=template)
+
+    def resized(self, factor: float) -> Hand:
+        """The same hand `factor` times as large, markers included."""
+        larger = replace(self, offsets=factor * self.offsets)
+        return larger.with_skeleton(factor * self.skeleton)
 
     def to_json(self) -> dict[str, Any]:
         """Plain data that `hand_from_json` reads back to the same hand, bit for bit."""

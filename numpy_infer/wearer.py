@@ -12,6 +12,7 @@ import numpy as np
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, FINGERS, Hand, hand_from_json
 from numpy_infer.model import Model
+from numpy_infer.networks import Network
 from numpy_infer.skeleton import rotations_from_angles
 
 FORMAT, VERSION = "jaxhand-calibration", 1
@@ -95,10 +96,40 @@ def _read(data: Any) -> Wearer:
 
 
 def calibrated(model: Model, wearer: Wearer) -> Model:
-    """The model as it runs for this person: joints and wrist pose on the person's bones.
+    """The model as it runs for this person, see `worn_by`, and with the person's flat pose.
 
     Raises:
         ValueError: the calibration is of another glove.
     """
     flat = None if wearer.flat is None else rotations_from_angles(wearer.flat)
-    return replace(model, wearer=wearer.hand, flat=flat)
+    return replace(worn_by(model, wearer.hand), flat=flat)
+
+
+def worn_by(model: Model, hand: Hand) -> Model:
+    """The model for other bones: joints and wrist pose are made with them, and networks see markers
+    in the size of hand that they were trained on, for they take a large hand for an open one.
+
+    Raises:
+        ValueError: the hand has other markers than the model.
+    """
+    factor = hand.size / model.hand.size
+    return replace(
+        model,
+        hand=model.hand.resized(factor),
+        wearer=hand,
+        marker_network=_resized(model.marker_network, factor, factor),
+        joint_network=_resized(model.joint_network, factor, 1),
+    )
+
+
+def _resized(network: Network | None, inputs: float, outputs: float) -> Network | None:
+    """The network with its inputs and outputs as large as this."""
+    if network is None:
+        return None
+    return replace(
+        network,
+        input_mean=np.float32(inputs) * network.input_mean,
+        input_scale=np.float32(inputs) * network.input_scale,
+        output_mean=np.float32(outputs) * network.output_mean,
+        output_scale=np.float32(outputs) * network.output_scale,
+    )
