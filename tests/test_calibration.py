@@ -39,7 +39,7 @@ from numpy_infer.skeleton import (  # noqa: E402
     rotations_from_angles,
 )
 
-PEOPLE, FRAMES, RATE, NOISE = 8, 240, 60.0, 1e-3
+PEOPLE, STRANGERS, FRAMES, RATE, NOISE = 8, 16, 240, 60.0, 1e-3
 OFFSET = 2e-3
 """Metres per axis: how far off the markers are, and are said to be."""
 DENSE, GLOVE = load_hand("dense19"), load_hand("glove9")
@@ -62,13 +62,16 @@ class Person(NamedTuple):
 
 @functools.cache
 def motions() -> simulation.Motion:
-    keys = jax.random.split(jax.random.key(0), PEOPLE)
+    keys = jax.random.split(jax.random.key(0), STRANGERS)
     move = jax.jit(jax.vmap(lambda key: simulation.motion(key, FRAMES, RATE)))
     return jax.tree.map(lambda array: np.asarray(array, np.float64), move(keys))
 
 
-def person(number: int, hand: Hand = DENSE, still: bool = False) -> Person:
-    bones = simulation.bone_lengths(jax.random.key(number), hand)
+def person(
+    number: int, hand: Hand = DENSE, still: bool = False, bones: Array | None = None
+) -> Person:
+    if bones is None:
+        bones = simulation.bone_lengths(jax.random.key(number), hand)
     random = np.random.default_rng(number)
     offsets = hand.offsets + OFFSET * random.normal(size=hand.offsets.shape)
     own = replace(hand, offsets=offsets).with_skeleton(np.asarray(bones))
@@ -127,16 +130,28 @@ def test_dense_markers_give_first_bones_knuckle_angles_and_middle_joints() -> No
     assert [round(c.noise, 4) for c, _, _ in found] == pytest.approx([NOISE] * PEOPLE, rel=0.1)
 
 
+def stranger(number: int) -> Person:
+    """Somebody out of the very priors that the fit is given, fingers' bases included."""
+    spread = np.repeat([arrow.PERSON_SPREAD, arrow.BONE_SPREAD, arrow.BONE_SPREAD], arrow.WIDTHS)
+    unlike = spread * np.random.default_rng(100 + number).normal(size=len(spread))
+    bones = arrow.skeleton(np.float32(DENSE.skeleton), np.float32(unlike))
+    return person(number, bones=bones)
+
+
 def test_intervals_hold_what_they_say() -> None:
     inside: dict[str, list[float]] = {field: [] for field in Unknowns._fields}
-    for found, error, _ in everyone():
+    for number in range(STRANGERS):
+        true = stranger(number)
+        found = calibrate(DENSE, true.markers, priors=Priors(offset=OFFSET))
+        error = errors(found, true)
         for field in Unknowns._fields:
             off, half = np.abs(getattr(error, field)), getattr(found.interval, field)
             rest = slice(1, None) if field == "bone_lengths" else slice(None)  # the wrist is none
             inside[field].append((off <= half)[rest].mean())
     shares = {field: float(np.mean(values)) for field, values in inside.items()}
-    assert min(shares.values()) > 0.93, shares
-    assert np.mean([shares[f] for f in ("bone_lengths", "offsets", "angles")]) < 0.97, shares
+    # The frames of a person are off together: a share of sixteen people is known to some 2 %.
+    assert 0.92 < min(shares.values()) <= max(shares.values()) < 0.985, shares
+    assert 0.93 < np.mean(list(shares.values())) < 0.97, shares
 
 
 def test_what_nineteen_markers_cannot_tell_is_flagged() -> None:
