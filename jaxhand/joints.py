@@ -11,8 +11,8 @@ from jaxhand.geometry import kabsch, untransform
 from jaxhand.networks import predict
 from jaxhand.skeleton import (
     align_fingers,
-    align_thumb,
     angles_from_rotations,
+    bend_fingers,
     flat_calibrated,
     forward_kinematics,
     rotations_from_angles,
@@ -51,7 +51,7 @@ def joint_stage(model: Model, markers: Array, rotation: Array, position: Array) 
     if model.alignment:
         # In the hand frame: far from the origin float32 is too coarse for it.
         still = jnp.eye(3, dtype=markers.dtype), jnp.zeros(3, markers.dtype)
-        for align in (align_fingers, align_thumb):
+        for align in (bend_fingers, align_fingers):
             placed = forward_kinematics(skeleton, local, *still)
             local = align(model.body, local, *placed, own, jnp.ones_like(own[..., 0]))
     positions, rotations = forward_kinematics(skeleton, local, rotation, position)

@@ -5,19 +5,23 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhand.geometry import apart, cross, product, rotation_from_vector, shortest_arc, solve
+from jaxhand.geometry import apart, cross, product, shortest_arc
 from numpy_infer.arrays import Array
 from numpy_infer.hand import JOINTS, Hand
 from numpy_infer.skeleton import (
+    BEND_NOISE,
+    BEND_PRIOR,
     CROSS,
     CROSS_SQUARED,
     EULER,
+    FARTHEST_BEND,
+    HINGE_AXES,
+    HINGE_CROSS,
+    HINGE_SQUARED,
+    HINGES,
     JOINT_AXES,
     SIGNS,
     SLOTS,
-    THUMB_ANGLES,
-    THUMB_NOISE,
-    THUMB_PRIOR,
 )
 
 
@@ -112,7 +116,7 @@ def align_fingers(
 
     The paper's middle of the last phalanx is that for a marker placed there. Here the marker's own
     modelled point is taken, so that joints which are right stay as they are, wherever the marker
-    sits. For what that leaves at the thumb see `align_thumb`.
+    sits. What that leaves, the distance from the base, is the matter of `bend_fingers`.
 
     Args:
         hand: its markers and their offsets.
@@ -136,34 +140,33 @@ def align_fingers(
     return local.at[..., ::3, :, :].set(product(turn, local[..., ::3, :, :]))
 
 
-def align_thumb(
+def bend_fingers(
     hand: Hand, local: Array, positions: Array, rotations: Array, markers: Array, weight: Array
 ) -> Array:
-    """Bends the thumb at all of its joints towards where its markers were measured.
+    """Bends each finger's outer two joints until its outermost marker is as far from the finger's
+    base as it was measured.
 
-    One rotation at the base, as the paper has it, falls short in a pinch (section 8): there the
-    tip's distance from the base is wrong too. After `align_fingers` a damped Gauss-Newton step over
-    the thumb's angles, about its joints' own axes as they stand, with `THUMB_NOISE` and
-    `THUMB_PRIOR`. Takes and gives what `align_fingers` does.
+    One rotation at the base, as the paper has it, falls short in a pinch (section 8): the tip's
+    distance from the base is wrong too. One damped step over the two flexions, with `BEND_NOISE`
+    and `BEND_PRIOR`, is left to `align_fingers` to point. Takes and gives what that does.
     """
-    own = np.array(hand.finger_markers[0], int)
-    if not len(own):
-        return local
-    modelled = marker_positions(hand, positions, rotations)[..., own, :]
-    pull = weight[..., own, None]
-    off = jnp.where(pull > 0, markers[..., own, :] - modelled, 0) * pull
-    axes = product(rotations[..., 1:4, :, :], jnp.asarray(JOINT_AXES[:3], local.dtype))
-    axes = axes.swapaxes(-1, -2)[..., THUMB_ANGLES[0], THUMB_ANGLES[1], :]
-    arms = modelled[..., None, :, :] - positions[..., 1 + THUMB_ANGLES[0], None, :]
-    carried = hand.placing[1][own] > THUMB_ANGLES[0][:, None]
-    reach = pull[..., None, :, :] * carried[..., None].astype(local.dtype)
-    slopes = cross(axes[..., None, :], arms) * reach
-    slopes = slopes.reshape(*slopes.shape[:-2], -1)
-    damping = (THUMB_NOISE / THUMB_PRIOR) ** 2 * jnp.eye(len(THUMB_ANGLES[0]), dtype=local.dtype)
-    gradient = product(slopes, off.reshape(*off.shape[:-2], -1, 1))[..., 0]
-    bend = solve(product(slopes, slopes.swapaxes(-1, -2)) + damping, gradient)
-    vectors = jnp.zeros((*bend.shape[:-1], 3, 3), local.dtype)
-    vectors = vectors.at[..., THUMB_ANGLES[0], THUMB_ANGLES[1]].set(bend)
-    vectors = product(jnp.asarray(JOINT_AXES[:3], local.dtype), vectors[..., None])[..., 0]
-    bent = product(local[..., :3, :, :], rotation_from_vector(vectors))
-    return local.at[..., :3, :, :].set(bent)
+    ends, has = hand.end_markers
+    base = positions[..., 1:16:3, :]
+    modelled = marker_positions(hand, positions, rotations)[..., ends, :]
+    share = weight[..., ends] * has.astype(weight.dtype)
+    way = modelled - base
+    reach = jnp.sqrt((way * way).sum(-1))
+    target = jnp.where(share[..., None] > 0, markers[..., ends, :] - base, way)
+    short = share * (jnp.sqrt((target * target).sum(-1)) - reach)
+    direction = way / jnp.where(reach > 0, reach, 1)[..., None]
+    axes = product(rotations[..., HINGES, :, :], jnp.asarray(HINGE_AXES, local.dtype))[..., 0]
+    arms = modelled[..., None, :] - positions[..., 1 + HINGES, :]
+    carried = jnp.asarray(hand.placing[1][ends][:, None] > HINGES, local.dtype)
+    slopes = (cross(axes, arms) * direction[..., None, :]).sum(-1) * carried
+    damped = (slopes * slopes).sum(-1) + (BEND_NOISE / BEND_PRIOR) ** 2
+    bend = jnp.clip(slopes * (short / damped)[..., None], -FARTHEST_BEND, FARTHEST_BEND)
+    bend = bend[..., None, None]
+    turn = jnp.sin(bend) * jnp.asarray(HINGE_CROSS, local.dtype)
+    turn += (1 - jnp.cos(bend)) * jnp.asarray(HINGE_SQUARED, local.dtype)
+    turn += jnp.eye(3, dtype=local.dtype)
+    return local.at[..., HINGES, :, :].set(product(turn, local[..., HINGES, :, :]))

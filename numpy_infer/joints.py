@@ -13,8 +13,8 @@ from numpy_infer.model import Model
 from numpy_infer.networks import Network, predict
 from numpy_infer.skeleton import (
     align_fingers,
-    align_thumb,
     angles_from_rotations,
+    bend_fingers,
     flat_calibrated,
     forward_kinematics,
     rotations_from_angles,
@@ -50,7 +50,7 @@ def joint_stage(model: Model, markers: Array, rotation: Array, position: Array) 
     if model.alignment:
         # In the hand frame: far from the origin float32 is too coarse for it.
         still = np.eye(3, dtype=markers.dtype), np.zeros(3, markers.dtype)
-        for align in (align_fingers, align_thumb):
+        for align in (bend_fingers, align_fingers):
             placed = forward_kinematics(skeleton, local, *still)
             local = align(model.body, local, *placed, own, np.ones_like(own[..., 0]))
     positions, rotations = forward_kinematics(skeleton, local, rotation, position)

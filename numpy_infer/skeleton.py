@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from numpy_infer.arrays import Array
-from numpy_infer.geometry import cross, rotation_from_vector, shortest_arc, solve
+from numpy_infer.geometry import cross, shortest_arc
 from numpy_infer.hand import ANGLES, JOINTS, POINTS, THUMB_AXES, Hand
 
 
@@ -49,14 +49,18 @@ _SLOT_ANGLES = np.minimum(SLOTS, len(ANGLES) - 1)
 _EYE = np.eye(3)
 _AXES_BACK = np.swapaxes(JOINT_AXES, -1, -2)
 
-THUMB_NOISE, THUMB_PRIOR = 2e-3, 0.1
-"""Metres and radians: how far a marker may be off, and how far one of the thumb's angles. A
-millimetre of noise can then turn a joint by 1.4 degrees, in the direction least determined."""
+HINGES = np.array([[3 * finger + 1, 3 * finger + 2] for finger in range(5)])
+"""`[5, 2]` the outer two joints of each finger, of the fifteen finger joints."""
+HINGE_AXES = JOINT_AXES[HINGES][..., :1]
+"""`[5, 2, 3, 1]` about which they flex, in their parent's frame."""
+HINGE_CROSS = np.stack([_cross_matrix(axis) for axis in HINGE_AXES.reshape(-1, 3)])
+HINGE_CROSS = HINGE_CROSS.reshape(5, 2, 3, 3)
+HINGE_SQUARED = HINGE_CROSS @ HINGE_CROSS
 
-THUMB_ANGLES = np.stack(EULER)[:, [angle.joint.startswith("thumb") for angle in ANGLES]]
-"""`[2, 6]` which of the thumb's three joints each of its angles turns, and about which axis."""
-
-_THUMB_DAMPING = (THUMB_NOISE / THUMB_PRIOR) ** 2 * np.eye(THUMB_ANGLES.shape[1])
+BEND_NOISE, BEND_PRIOR = 2e-3, 0.1
+"""Metres and radians: how far a marker may be off, and how far a joint."""
+FARTHEST_BEND = 0.5
+"""Radians: no more in a frame, whatever is said to be measured."""
 
 
 def rotations_from_angles(angles: Array) -> Array:
@@ -145,7 +149,7 @@ def align_fingers(
 
     The paper's middle of the last phalanx is that for a marker placed there. Here the marker's own
     modelled point is taken, so that joints which are right stay as they are, wherever the marker
-    sits. For what that leaves at the thumb see `align_thumb`.
+    sits. What that leaves, the distance from the base, is the matter of `bend_fingers`.
 
     Args:
         hand: its markers and their offsets.
@@ -171,35 +175,35 @@ def align_fingers(
     return local
 
 
-def align_thumb(
+def bend_fingers(
     hand: Hand, local: Array, positions: Array, rotations: Array, markers: Array, weight: Array
 ) -> Array:
-    """Bends the thumb at all of its joints towards where its markers were measured.
+    """Bends each finger's outer two joints until its outermost marker is as far from the finger's
+    base as it was measured.
 
-    One rotation at the base, as the paper has it, falls short in a pinch (section 8): there the
-    tip's distance from the base is wrong too. After `align_fingers` a damped Gauss-Newton step over
-    the thumb's angles, about its joints' own axes as they stand, with `THUMB_NOISE` and
-    `THUMB_PRIOR`. Takes and gives what `align_fingers` does.
+    One rotation at the base, as the paper has it, falls short in a pinch (section 8): the tip's
+    distance from the base is wrong too. One damped step over the two flexions, with `BEND_NOISE`
+    and `BEND_PRIOR`, is left to `align_fingers` to point. Takes and gives what that does.
     """
-    own = np.array(hand.finger_markers[0], int)
-    if not len(own):
-        return local
-    modelled = marker_positions(hand, positions, rotations)[..., own, :]
-    pull = weight[..., own, None]
-    off = np.where(pull > 0, markers[..., own, :] - modelled, 0) * pull
-    axes = rotations[..., 1:4, :, :] @ JOINT_AXES[:3].astype(local.dtype, copy=False)
-    axes = axes.swapaxes(-1, -2)[..., THUMB_ANGLES[0], THUMB_ANGLES[1], :]
-    arms = modelled[..., None, :, :] - positions[..., 1 + THUMB_ANGLES[0], None, :]
-    carried = hand.placing[1][own] > THUMB_ANGLES[0][:, None]
-    reach = pull[..., None, :, :] * carried[..., None].astype(local.dtype)
-    slopes = cross(axes[..., None, :], arms) * reach
-    slopes = slopes.reshape(*slopes.shape[:-2], -1)
-    damping = _THUMB_DAMPING.astype(local.dtype, copy=False)
-    gradient = (slopes @ off.reshape(*off.shape[:-2], -1, 1))[..., 0]
-    bend = solve(slopes @ slopes.swapaxes(-1, -2) + damping, gradient)
-    vectors = np.zeros((*bend.shape[:-1], 3, 3), local.dtype)
-    vectors[..., THUMB_ANGLES[0], THUMB_ANGLES[1]] = bend
-    vectors = (JOINT_AXES[:3].astype(local.dtype, copy=False) @ vectors[..., None])[..., 0]
+    ends, has = hand.end_markers
+    base = positions[..., 1:16:3, :]
+    modelled = marker_positions(hand, positions, rotations)[..., ends, :]
+    share = weight[..., ends] * has.astype(weight.dtype)
+    way = modelled - base
+    reach = np.sqrt((way * way).sum(-1))
+    target = np.where(share[..., None] > 0, markers[..., ends, :] - base, way)
+    short = share * (np.sqrt((target * target).sum(-1)) - reach)
+    direction = way / np.where(reach > 0, reach, 1)[..., None]
+    axes = (rotations[..., HINGES, :, :] @ HINGE_AXES.astype(local.dtype, copy=False))[..., 0]
+    arms = modelled[..., None, :] - positions[..., 1 + HINGES, :]
+    carried = (hand.placing[1][ends][:, None] > HINGES).astype(local.dtype)
+    slopes = (cross(axes, arms) * direction[..., None, :]).sum(-1) * carried
+    damped = (slopes * slopes).sum(-1) + (BEND_NOISE / BEND_PRIOR) ** 2
+    bend = slopes * (short / damped)[..., None]
+    bend = np.minimum(np.maximum(bend, -FARTHEST_BEND), FARTHEST_BEND)[..., None, None]
+    turn = np.sin(bend) * HINGE_CROSS.astype(local.dtype, copy=False)
+    turn += (1 - np.cos(bend)) * HINGE_SQUARED.astype(local.dtype, copy=False)
+    turn += _EYE.astype(local.dtype, copy=False)
     local = local.copy()
-    local[..., :3, :, :] = local[..., :3, :, :] @ rotation_from_vector(vectors)
+    local[..., HINGES, :, :] = turn @ local[..., HINGES, :, :]
     return local
