@@ -31,11 +31,13 @@ class Frames(NamedTuple):
     """Frames to train or validate on, in any order."""
 
     markers: Array
-    """`[N, M, 3]` metres, any frame of reference; all of them measured."""
+    """`[N, M, 3]` metres, any frame of reference; NaN where not measured."""
     angles: Array | None = None
     """`[N, 26]` radians, NaN where a frame has no joint truth; None without any."""
     weight: Array | None = None
     """`[N]` how often a frame is drawn; None draws every frame once an epoch."""
+    simulated: float = 0.0
+    """Share of the frames drawn in whose place fresh ones are simulated."""
 
 
 class Task(NamedTuple):
@@ -56,18 +58,21 @@ class Task(NamedTuple):
     """Weights → validation loss, and mean error in metres."""
 
 
-@partial(jax.jit, static_argnames="shape")
-def draw_visible(key: Array, occlusions: Array, shape: tuple[int, int]) -> Array:
-    """`[N, M]` False at the markers to hide: k of them with probability `occlusions[k - 1]`, any k
-    alike. Three are always left, so that a registration is determined."""
+FEWEST_LEFT = 3
+"""Markers that are never hidden: fewer do not determine a registration."""
+
+
+@jax.jit
+def draw_visible(key: Array, occlusions: Array, seen: Array) -> Array:
+    """`[N, M]` False at the markers to hide, and where `seen [N, M]` is: k of those seen with
+    probability `occlusions[k - 1]`, any k alike, `FEWEST_LEFT` at least left."""
     number_key, order_key = jax.random.split(key)
-    frames, markers = shape
     limits = jnp.cumsum(occlusions)[:-1]
-    number = 1 + (jax.random.uniform(number_key, (frames, 1)) >= limits).sum(-1)
-    order = jax.random.uniform(order_key, shape)
+    number = 1 + (jax.random.uniform(number_key, (len(seen), 1)) >= limits).sum(-1)
+    order = jnp.where(seen, jax.random.uniform(order_key, seen.shape), 1)
     # Ranks by comparison: sorting is slow on a CPU.
     rank = (order[:, :, None] > order[:, None, :]).sum(-1)
-    return rank >= jnp.minimum(number, markers - 3)[:, None]
+    return seen & (rank >= jnp.minimum(number, seen.sum(-1) - FEWEST_LEFT)[:, None])
 
 
 @jax.jit
@@ -78,15 +83,40 @@ def register(template: Array, markers: Array, weight: Array) -> Array:
 
 
 def occlude(key: Array, markers: Array, template: Array, occlusions: Array) -> tuple[Array, Array]:
-    """Hides markers. Gives `[N, M]` visible, and `[N, M, 3]` all markers as registered by them."""
-    visible = draw_visible(key, occlusions, markers.shape[:-1])
-    return visible, register(template, markers, visible.astype(markers.dtype))
+    """Hides markers. Gives `[N, M]` visible, and `[N, M, 3]` all markers as registered by them, NaN
+    where not measured."""
+    seen = jnp.isfinite(markers).all(-1)
+    visible = draw_visible(key, occlusions, seen)
+    registered = register(
+        template, jnp.where(seen[..., None], markers, 0), visible.astype(markers.dtype)
+    )
+    return visible, jnp.where(seen[..., None], registered, jnp.nan)
 
 
 def _occluded_inputs(
-    key: Array, markers: Array, template: Array, occlusions: Array, network: Network
+    key: Array,
+    markers: Array,
+    hand: Hand,
+    simulated: float,
+    occlusions: Array,
+    network: Network,
 ) -> tuple[Array, Array]:
+    if simulated:
+        markers, _ = _renewed(jax.random.fold_in(key, 1), hand, simulated, markers)
+    template = jnp.asarray(hand.template, jnp.float32)
     return _scaled(network, *occlude(key, markers, template, occlusions))
+
+
+@partial(jax.jit, static_argnames=("hand", "share"))
+def _renewed(
+    key: Array, hand: Hand, share: float, markers: Array, angles: Array | None = None
+) -> tuple[Array, Array | None]:
+    """The frames with a share of them replaced by simulated ones: other people, other postures."""
+    draw_key, share_key = jax.random.split(key)
+    drawn, drawn_angles = simulation.frames(draw_key, hand, len(markers))
+    chosen = jax.random.uniform(share_key, (len(markers), 1)) < share
+    markers = jnp.where(chosen[..., None], drawn, markers)
+    return markers, None if angles is None else jnp.where(chosen, drawn_angles, angles)
 
 
 @jax.jit
@@ -99,11 +129,13 @@ def _scaled(network: Network, visible: Array, registered: Array) -> tuple[Array,
 def _marker_error(
     weights: dict[str, Array], network: Network, visible: Array, truth: Array
 ) -> tuple[Array, Array]:
-    inputs = truth.reshape(len(truth), -1)
+    measured = jnp.isfinite(truth)
+    inputs = jnp.where(measured, truth, 0).reshape(len(truth), -1)
     known = jnp.repeat(visible, 3, -1)
     off = predict(replace(network, arrays=weights), inputs, known) - inputs
     distance = _lengths(off.reshape(truth.shape))
-    return ((off / network.output_scale) ** 2).mean(), distance.mean(where=~visible)
+    square = ((off / network.output_scale) ** 2).mean(where=measured.reshape(off.shape))
+    return square, distance.mean(where=measured[..., 0] & ~visible)
 
 
 def marker_task(
@@ -113,34 +145,63 @@ def marker_task(
     key: Array,
     hidden: Spec,
     occlusions: tuple[float, ...],
+    start: Network | None = None,
 ) -> Task:
-    """The marker network: registered visible markers → all markers, in the same frame."""
+    """The marker network: registered visible markers → all markers, in the same frame.
+
+    Markers that were not measured count for nothing, neither as inputs nor as targets. `start`: the
+    network to go on from, instead of a new one with layers `hidden`.
+    """
     template = jnp.asarray(hand.template, jnp.float32)
     markers, held_out = (jnp.asarray(x.markers, jnp.float32) for x in (training, validation))
-    registered = register(template, markers, jnp.ones(markers.shape[:-1]))
-    mean, scale = registered.mean(0).ravel(), (registered - registered.mean(0)).std()
-    network = _untrained(hidden, mean, scale, mean, scale, key)
     probabilities = jnp.asarray(occlusions, jnp.float32)
-    hide = partial(_occluded_inputs, template=template, occlusions=probabilities, network=network)
+    network = start or _new_marker_network(markers, hand, key, hidden)
+    hide = partial(
+        _occluded_inputs,
+        hand=hand,
+        simulated=training.simulated,
+        occlusions=probabilities,
+        network=replace(network, arrays={}),
+    )
     # The same masks whatever the seed, so that losses of different runs can be compared.
     visible, truth = occlude(jax.random.key(0), held_out, template, probabilities)
+    whole = bool(np.isfinite(training.markers).all())
     return Task(
         name="marker_network",
         network=network,
         frames=markers,
         weight=_weight(training),
         prepare=hide,
-        loss=mean_square,
+        loss=mean_square if whole else mean_square_of_measured,
         measure=partial(_marker_error, network=network, visible=visible, truth=truth),
     )
+
+
+def _new_marker_network(markers: Array, hand: Hand, key: Array, hidden: Spec) -> Network:
+    seen = jnp.isfinite(markers).all(-1)
+    registered = register(
+        jnp.asarray(hand.template, jnp.float32),
+        jnp.where(seen[..., None], markers, 0),
+        seen.astype(markers.dtype),
+    )
+    mean = registered.mean(0, where=seen[..., None])
+    scale = (registered - mean).std(where=seen[..., None])
+    return _untrained(hidden, mean.ravel(), scale, mean.ravel(), scale, key)
 
 
 def _mean_square(outputs: Array, targets: Array) -> Array:
     return ((outputs - targets) ** 2).mean()
 
 
+def _mean_square_of_measured(outputs: Array, targets: Array) -> Array:
+    known = jnp.isfinite(targets)
+    return (jnp.where(known, outputs - targets, 0) ** 2).mean(where=known)
+
+
 mean_square = jax.tree_util.Partial(_mean_square)
 """The paper's loss (section 3.4)."""
+mean_square_of_measured = jax.tree_util.Partial(_mean_square_of_measured)
+"""The same over the markers that were measured."""
 
 
 def as_is(key: Array, frames: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -163,6 +224,9 @@ class Augmentation(NamedTuple):
     """Share of frames in which each finger is taken from another frame."""
     drawn: float
     """Share of frames that are drawn postures, on the training skeleton."""
+    simulated: float = 0.0
+    """Share of frames that are other people, see `Frames.simulated`; the rest are what the others
+    are shares of."""
 
 
 def mix_fingers(key: Array, hand: Hand, markers: Array, angles: Array) -> tuple[Array, Array]:
@@ -210,6 +274,11 @@ def _joint_frames(
         chosen = share > 1 - augmentation.drawn
         markers = jnp.where(chosen[..., None], drawn, markers)
         angles = jnp.where(chosen, drawn_angles, angles)
+    if augmentation.simulated:
+        # People differ in where the alignment markers put their hand frame.
+        fresh_key = jax.random.fold_in(key, 1)
+        markers, angles = _renewed(fresh_key, hand, augmentation.simulated, markers, angles)
+        markers = align(markers, hand)
     inputs = (markers.reshape(len(markers), -1) - network.input_mean) / network.input_scale
     return inputs, _joint_targets(angles, hand.skeleton, network, point_scale)
 
@@ -265,16 +334,14 @@ def joint_task(
     hidden: Spec,
     position_weight: float,
     augmentation: Augmentation,
+    start: Network | None = None,
 ) -> Task:
-    """The joint network: markers as registered by the alignment markers → the 26 angles."""
+    """The joint network: markers as registered by the alignment markers → the 26 angles. `start`:
+    the network to go on from, instead of a new one with layers `hidden`."""
     markers, angles, weight = _aligned(training, hand)
     held_out, truth, _ = _aligned(validation, hand)
-    inputs = markers.reshape(len(markers), -1)
-    mean, scale = inputs.mean(0), (inputs - inputs.mean(0)).std()
-    # One number for all angles: what hardly moves, or was not observed, must not count as much as
-    # what moves the fingertips.
-    angle_mean, angle_scale = angles.mean(0), (angles - angles.mean(0)).std()
-    network = _untrained(hidden, mean, scale, angle_mean, angle_scale, key)
+    augmentation = augmentation._replace(simulated=training.simulated)
+    network = start or _new_joint_network(markers, angles, key, hidden)
     skeleton = jnp.asarray(hand.skeleton, jnp.float32)
     points = joint_points(skeleton, angles)
     point_scale = (points - points.mean(0)).std()
@@ -307,16 +374,30 @@ def joint_task(
     )
 
 
+def _new_joint_network(markers: Array, angles: Array, key: Array, hidden: Spec) -> Network:
+    inputs = markers.reshape(len(markers), -1)
+    mean, scale = inputs.mean(0), (inputs - inputs.mean(0)).std()
+    # One number for all angles: what hardly moves, or was not observed, must not count as much as
+    # what moves the fingertips.
+    angle_mean, angle_scale = angles.mean(0), (angles - angles.mean(0)).std()
+    return _untrained(hidden, mean, scale, angle_mean, angle_scale, key)
+
+
 def _aligned(frames: Frames, hand: Hand) -> tuple[Array, Array, Array | None]:
     """Markers `[N, M, 3]` metres, hand frame, angles `[N, 26]` and weights of the frames with joint
-    truth."""
+    truth and all markers."""
     known = np.isfinite(np.asarray(frames.angles)).all(-1)
+    known &= np.isfinite(np.asarray(frames.markers)).all((-1, -2))
     angles = jnp.asarray(np.asarray(frames.angles)[known], jnp.float32)
     markers = jnp.asarray(np.asarray(frames.markers)[known], jnp.float32)
-    alignment = jnp.broadcast_to(jnp.asarray(hand.alignment_weight), markers.shape[:-1])
-    aligned = register(jnp.asarray(hand.template, jnp.float32), markers, alignment)
     weight = _weight(frames)
-    return aligned, angles, weight if weight is None else weight[known]
+    return align(markers, hand), angles, weight if weight is None else weight[known]
+
+
+def align(markers: Array, hand: Hand) -> Array:
+    """`[N, M, 3]` metres: frames moved to the hand frame by the alignment markers."""
+    alignment = jnp.broadcast_to(jnp.asarray(hand.alignment_weight), markers.shape[:-1])
+    return register(jnp.asarray(hand.template, jnp.float32), markers, alignment)
 
 
 def _untrained(

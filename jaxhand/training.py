@@ -22,16 +22,23 @@ import numpy as np
 import optax
 from rich.console import Console
 
-from jaxhand import runs, simulation
-from jaxhand.datasets import Split, load
+from jaxhand import runs
 from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
 from jaxhand.options import DataSets, Layers, Takes
-from jaxhand.sequences import Dataset, complete_frames
 from jaxhand.sparse_fit import prior_of
-from jaxhand.tasks import Augmentation, Frames, Task, joint_task, marker_task, mean_square
+from jaxhand.tasks import (
+    FEWEST_LEFT,
+    Augmentation,
+    Frames,
+    Task,
+    joint_task,
+    marker_task,
+    mean_square,
+)
+from jaxhand.training_data import collect
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, Hand, load_hand
+from numpy_infer.hand import Hand
 from numpy_infer.model import Model
 from numpy_infer.networks import Dense, Dropout, Spec, write_spec
 
@@ -57,7 +64,7 @@ class TrainingConfig:
 
     data: DataSets
     """Data set NAME[:PATH][@WEIGHT], as often as wanted; a frame of weight 2 is drawn twice as
-    often."""
+    often. `simulated` needs no path: it is made meanwhile, alone or beside recordings."""
     out: Path
     """Folder of the run: config.json, metrics.jsonl, checkpoints, model.npz."""
     hand: str | None = None
@@ -96,6 +103,9 @@ class TrainingConfig:
     """Epochs without progress after which the training ends."""
     epochs: int = 300
     """The most epochs for each network."""
+    start: Path | None = None
+    """A model to go on from, with its hand and its layers: recordings of your own then refine it
+    (with a lower --learning-rate). Networks that the data say nothing of stay as they are."""
     seed: int = 0
     """The same seed gives the same numbers on the same machine."""
     resume: bool = False
@@ -251,19 +261,21 @@ def fit_networks(
     report: Report = lambda _: None,
     folder: Path | None = None,
     joint_frames: tuple[Frames, Frames] | None = None,
+    start: Model | None = None,
 ) -> Model:
     """Trains on arrays, without any data set on disk.
 
     Ctrl-C ends the training and keeps the best weights; `Model.training["interrupted"]` says so.
 
     Args:
-        training, validation: complete frames; both with angles where a joint network is wanted.
+        training, validation: frames; both with angles where a joint network is wanted.
         hand: markers are registered to its template, and angles move its skeleton.
         config: of which `data`, `out`, `hand` and the takes are not read.
         report: called after every epoch.
         folder: where metrics and checkpoints are kept and, if there are any, gone on from; None
             keeps nothing.
         joint_frames: frames to train and validate the joint network on instead; with angles.
+        start: a model of the same hand, whose networks are trained further.
 
     Raises:
         ValueError: misshapen or too few frames, or no loss was finite.
@@ -283,6 +295,7 @@ def fit_networks(
             hand,
             hidden=config.marker_layers,
             occlusions=config.occlusions,
+            start=start.marker_network if start else None,
         )
     ]
     joint_frames = joint_frames or (training, validation)
@@ -295,9 +308,13 @@ def fit_networks(
                 hidden=config.joint_layers,
                 position_weight=config.position_weight,
                 augmentation=Augmentation(config.mixed, config.drawn),
+                start=start.joint_network if start else None,
             )
         )
     networks: dict[str, Any] = {}
+    if start is not None:
+        before = {name: getattr(start, name) for name in ("marker_network", "joint_network")}
+        networks = {name: network for name, network in before.items() if network is not None}
     summary: dict[str, Any] = {"frames": len(training.markers), "interrupted": False}
     for number, make in enumerate(tasks):
         key = jax.random.fold_in(jax.random.key(config.seed), number)
@@ -314,7 +331,10 @@ def fit_networks(
     if not networks:
         raise KeyboardInterrupt
     joints = "learned" if "joint_network" in networks else "none"
-    if joints == "learned":
+    if joint_frames[0].angles is None:
+        if start is not None and "posture" in start.training:
+            summary["posture"] = start.training["posture"]
+    elif joints == "learned":
         angles = np.asarray(joint_frames[0].angles)
         # What the rival that fits postures knows of them, see `sparse_fit`.
         posture = prior_of(angles[np.isfinite(angles).all(-1)])._asdict()
@@ -326,11 +346,15 @@ def _check_frames(what: str, frames: Frames, hand: Hand, least: int) -> None:
     shape = np.shape(frames.markers)
     if len(shape) != 3 or shape[1:] != (len(hand), 3):
         raise ValueError(f"{what}: expected markers [N, {len(hand)}, 3], found {list(shape)}")
-    if not np.isfinite(frames.markers).all():
-        raise ValueError(f"{what}: markers must all be measured, found some that are not finite")
+    seen = np.isfinite(frames.markers).all(-1).sum(-1)
+    if (seen <= FEWEST_LEFT).any():
+        raise ValueError(
+            f"{what}: expected more than {FEWEST_LEFT} markers measured in every frame, found "
+            f"{seen.min()}"
+        )
     known = shape[0] if frames.angles is None else np.isfinite(frames.angles).all(-1).sum()
     if known < least:
-        raise ValueError(f"{what}: expected {least} or more complete frames, found {known}")
+        raise ValueError(f"{what}: expected {least} or more frames, found {known}")
 
 
 def _fit(
@@ -399,8 +423,7 @@ def train(config: TrainingConfig) -> Model:
         raise ValueError("name a data set to train on: --data NAME:PATH")
     console = Console(soft_wrap=True, highlight=False)
     runs.check(config.out, _plain(config))
-    training, validation = _load(config, "train"), _load(config, "validation")
-    hand = mean_hand(training)
+    given = collect(config)
     runs.create(config.out, _plain(config))
 
     def report(m: Metrics) -> None:
@@ -411,77 +434,28 @@ def train(config: TrainingConfig) -> Model:
             f"rate {m.learning_rate:.1e}  {m.frames_per_second:,.0f} frames/s  at most {left} left"
         )
 
-    frames, held_out = gather(training), gather(validation)
-    joint_frames = None
-    if config.joints and (frames.angles is None or held_out.angles is None):
-        console.print(
-            "the data hold no joints: the joint network is trained on simulated postures of "
-            f"{hand.name}"
-        )
-        joint_frames = simulated_frames(hand, config.seed)
-    model = fit_networks(frames, held_out, hand, config, report, config.out, joint_frames)
+    for note in given.notes:
+        console.print(note)
+    model = fit_networks(
+        given.training,
+        given.validation,
+        given.hand,
+        config,
+        report,
+        config.out,
+        given.joint_frames,
+        given.start,
+    )
     if model.training["interrupted"]:
         console.print("interrupted: the best weights so far are kept; --resume goes on")
     model = replace(model, training={**model.training, "config": _plain(config)})
     try:
-        model = finish(model, [s for d in validation for s in d.sequences], console.print)
+        model = finish(model, given.sequences, console.print)
     except KeyboardInterrupt:
         console.print("interrupted: fade and expected error keep their defaults")
     model = export(model, config.out / "model.npz", overwrite=True)
     console.print(f"wrote {config.out / 'model.npz'}")
     return model
-
-
-SIMULATED = 20_000
-"""Postures to train the joint network on where the data hold none; a tenth of it to validate on."""
-
-
-def simulated_frames(hand: Hand, seed: int) -> tuple[Frames, Frames]:
-    """Postures of simulated people in a glove, to train and to validate a joint network on."""
-    keys = jax.random.split(jax.random.key(seed))
-    parts = [
-        simulation.frames(key, hand, count)
-        for key, count in zip(keys, (SIMULATED, SIMULATED // 10), strict=True)
-    ]
-    return Frames(*parts[0]), Frames(*parts[1])
-
-
-def mean_hand(datasets: list[Dataset]) -> Hand:
-    """The hand of the data, with the mean of the skeletons that are known, each frame alike."""
-    known = [d for d in datasets if d.observed_angles is not None]
-    if not known:
-        return datasets[0].hand
-    frames = [sum(len(s.markers) for s in d.sequences) for d in known]
-    skeleton = np.average([d.hand.skeleton for d in known], axis=0, weights=frames)
-    return known[0].hand.with_skeleton(skeleton)
-
-
-def _load(config: TrainingConfig, split: Split) -> list[Dataset]:
-    hand = None if config.hand is None else load_hand(config.hand)
-    takes = config.train if split == "train" else config.validation
-    datasets = [load(spec, split, hand=hand, takes=takes or None) for spec in config.data]
-    for dataset in datasets[1:]:
-        if dataset.hand.markers != datasets[0].hand.markers:
-            raise ValueError(
-                f"{dataset.name} has markers {', '.join(dataset.hand.markers)}; {datasets[0].name} "
-                f"has {', '.join(datasets[0].hand.markers)}: pass one --hand for both"
-            )
-    return datasets
-
-
-def gather(datasets: list[Dataset]) -> Frames:
-    """The complete frames of all data sets, with their weights."""
-    parts = [complete_frames(dataset) for dataset in datasets]
-    angles = None
-    if any(p.angles is not None for p in parts):
-        unknown = [np.full((len(p.markers), len(ANGLES)), np.nan, np.float32) for p in parts]
-        angles = np.concatenate(
-            [u if p.angles is None else p.angles for p, u in zip(parts, unknown, strict=True)]
-        )
-    weight = None
-    if len({dataset.weight for dataset in datasets}) > 1:
-        weight = np.repeat([d.weight for d in datasets], [len(p.markers) for p in parts])
-    return Frames(np.concatenate([p.markers for p in parts]), angles, weight)
 
 
 def _plain(config: TrainingConfig) -> dict[str, Any]:

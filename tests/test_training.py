@@ -15,7 +15,7 @@ pytest.importorskip("tyro")
 
 from strategies import HIGH, LOW, turn  # noqa: E402
 
-from jaxhand import cli, options, runs, tasks, training  # noqa: E402
+from jaxhand import cli, options, runs, tasks, training, training_data  # noqa: E402
 from jaxhand.networks import predict  # noqa: E402
 from jaxhand.sequences import Dataset, Sequence  # noqa: E402
 from jaxhand.skeleton import (  # noqa: E402
@@ -82,7 +82,9 @@ def without_clock(metrics: dict[str, Any]) -> dict[str, Any]:
 
 def visible_of(occlusions: tuple[float, ...], count: int = 20000, markers: int = 9) -> Any:
     probabilities = np.array(occlusions, np.float32)
-    return np.asarray(tasks.draw_visible(jax.random.key(3), probabilities, (count, markers)))
+    return np.asarray(
+        tasks.draw_visible(jax.random.key(3), probabilities, np.ones((count, markers), bool))
+    )
 
 
 def test_as_many_markers_are_hidden_as_asked() -> None:
@@ -110,8 +112,8 @@ def marker_task() -> tasks.Task:
 
 
 def masks_of(key: Any) -> Any:
-    shape = TRAINING.markers.shape[:-1]
-    return np.asarray(tasks.draw_visible(key, OCCLUSIONS, shape))
+    seen = np.ones(TRAINING.markers.shape[:-1], bool)
+    return np.asarray(tasks.draw_visible(key, OCCLUSIONS, seen))
 
 
 def test_hidden_inputs_are_zero(marker_task: tasks.Task) -> None:
@@ -369,7 +371,7 @@ def test_a_run_leaves_a_model_and_goes_on(tmp_path: Path, monkeypatch: pytest.Mo
         "a": make_dataset("a", halves[0], 2.0, 1.1),
         "b": make_dataset("b", halves[1], 1.0, None),
     }
-    monkeypatch.setattr(training, "load", lambda spec, split, **_: datasets[spec])
+    monkeypatch.setattr(training_data, "load", lambda spec, split, **_: datasets[spec])
     config = replace(CONFIG, data=("a", "b"), out=tmp_path / "run", epochs=1, joints=False)
     model = training.train(config)
     assert_same_networks(model_file.load(tmp_path / "run" / "model.npz"), model)
@@ -386,30 +388,30 @@ def test_a_run_leaves_a_model_and_goes_on(tmp_path: Path, monkeypatch: pytest.Mo
 def test_data_sets_are_joined_frame_by_frame() -> None:
     known = make_dataset("a", Frames(TRAINING.markers[:40], TRAINING.angles[:40]), 2.0, 1.1)
     bare = make_dataset("b", Frames(VALIDATION.markers[:20]), 1.0, None)
-    frames = training.gather([known, bare])
+    frames = training_data.gather([known, bare])
     np.testing.assert_array_equal(frames.markers[:40], TRAINING.markers[:40])
     np.testing.assert_array_equal(frames.angles[:40], TRAINING.angles[:40])
     assert np.isnan(frames.angles[40:]).all()
     np.testing.assert_array_equal(frames.weight, [2.0] * 40 + [1.0] * 20)
-    assert training.gather([bare, bare])[1:] == (None, None)
+    assert training_data.gather([bare, bare])[1:3] == (None, None)
     # Bones are those of the data set that knows them.
-    hand = training.mean_hand([bare, known])
+    hand = training_data.mean_hand([bare, known])
     np.testing.assert_allclose(hand.skeleton, HAND.skeleton * 1.1)
 
 
 def test_hands_are_averaged_over_frames() -> None:
     few, many = Frames(TRAINING.markers[:80], TRAINING.angles[:80]), TRAINING
-    hand = training.mean_hand(
+    hand = training_data.mean_hand(
         [make_dataset("few", few, 1.0, 1.5), make_dataset("many", many, 1.0, 1.0)]
     )
     np.testing.assert_allclose(hand.skeleton, HAND.skeleton * 1.1)
-    assert training.mean_hand([make_dataset("bare", few, 1.0, None)]).name == HAND.name
+    assert training_data.mean_hand([make_dataset("bare", few, 1.0, None)]).name == HAND.name
 
 
 def test_data_sets_of_different_markers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     other = replace(make_dataset("b", VALIDATION, 1.0, None), hand=load_hand("dense19"))
     datasets = {"a": make_dataset("a", TRAINING, 1.0, None), "b": other}
-    monkeypatch.setattr(training, "load", lambda spec, split, **_: datasets[spec])
+    monkeypatch.setattr(training_data, "load", lambda spec, split, **_: datasets[spec])
     with pytest.raises(ValueError, match=r"b has markers .* pass one --hand"):
         training.train(replace(CONFIG, data=("a", "b")))
 
@@ -435,10 +437,10 @@ def test_senseless_configs_are_refused(wrong: dict[str, Any], message: str) -> N
 def test_senseless_frames_are_refused() -> None:
     with pytest.raises(ValueError, match=r"expected markers \[N, 9, 3\], found \[320, 8, 3\]"):
         fit_networks(Frames(TRAINING.markers[:, :8]), VALIDATION, HAND, CONFIG)
-    with pytest.raises(ValueError, match="expected 32 or more complete frames, found 31"):
+    with pytest.raises(ValueError, match="expected 32 or more frames, found 31"):
         fit_networks(Frames(TRAINING.markers[:31]), VALIDATION, HAND, CONFIG)
     holes = np.where(np.arange(320)[:, None, None] == 7, np.nan, TRAINING.markers)
-    with pytest.raises(ValueError, match="not finite"):
+    with pytest.raises(ValueError, match="more than 3 markers measured in every frame, found 0"):
         fit_networks(Frames(holes), VALIDATION, HAND, CONFIG)
 
 
@@ -481,3 +483,72 @@ def test_the_command_line_says_what_is_wrong_in_one_line(
 ) -> None:
     assert cli.train(["--data", "nonsense", "--out", str(tmp_path)]) == 2
     assert "jaxhand train: no data set 'nonsense'" in capsys.readouterr().err
+
+
+# --- what is simulated, and what is only partly seen
+
+
+def with_gaps(seed: int = 0) -> Frames:
+    """The training frames with up to four markers of each not measured."""
+    missing = np.random.default_rng(seed).permuted(
+        np.arange(9) < np.arange(len(TRAINING.markers))[:, None] % 5, axis=-1
+    )
+    return Frames(np.where(missing[..., None], np.nan, TRAINING.markers))
+
+
+def test_what_was_not_measured_teaches_nothing() -> None:
+    frames, key = with_gaps(), jax.random.key(5)
+    args = VALIDATION, HAND, jax.random.key(0), CONFIG.marker_layers, CONFIG.occlusions
+    task = tasks.marker_task(frames, *args)
+    inputs, targets = map(np.asarray, task.prepare(key, frames.markers))
+    missing = np.isnan(frames.markers).reshape(len(inputs), -1)
+    assert np.isfinite(inputs).all()
+    np.testing.assert_array_equal(np.isnan(targets), missing)
+    assert ((inputs != 0) & ~missing).reshape(-1, 9, 3).any(-1).sum(-1).min() >= 3
+    hidden_on_purpose = (inputs == 0) & ~missing
+    assert hidden_on_purpose.any(-1).mean() > 0.9
+    outputs = np.where(missing, 1e3, np.where(np.isnan(targets), 0, targets))
+    assert float(task.loss(outputs, targets)) == 0
+    slope = jax.grad(task.loss)(outputs.astype(np.float32), targets)
+    assert np.isfinite(slope).all()
+
+
+def test_a_frame_with_too_little_to_see_is_left_out() -> None:
+    frames = with_gaps().markers.copy()
+    frames[3, :6] = np.nan
+    found = training_data.gather([make_dataset("a", Frames(frames), 1.0, None)])
+    np.testing.assert_array_equal(found.markers, np.delete(frames, 3, 0))
+    assert fit_networks(found, VALIDATION, HAND, replace(CONFIG, joints=False)).marker_network
+
+
+def test_simulated_frames_are_others_in_every_epoch_and_as_many_as_asked() -> None:
+    frames = TRAINING._replace(simulated=0.4)
+    args = VALIDATION, HAND, jax.random.key(0)
+    markers = tasks.marker_task(frames, *args, CONFIG.marker_layers, CONFIG.occlusions)
+    joints = tasks.joint_task(frames, *args, CONFIG.joint_layers, 1.0, tasks.Augmentation(0, 0))
+    plain = tasks.joint_task(TRAINING, *args, CONFIG.joint_layers, 1.0, tasks.Augmentation(0, 0))
+    for task, bare in ((markers, None), (joints, plain)):
+        one, two = (np.asarray(task.prepare(jax.random.key(i), task.frames)[1]) for i in (1, 2))
+        same = np.asarray(task.prepare(jax.random.key(1), task.frames)[1])
+        np.testing.assert_array_equal(one, same)
+        assert (one != two).any(-1).mean() > 0.5
+        if bare is not None:
+            kept = np.asarray(bare.prepare(jax.random.key(1), bare.frames)[1])
+            share = (np.abs(one - kept).max(-1) > 1e-4).mean()
+            assert share == pytest.approx(0.4, abs=0.06)
+
+
+def test_a_training_goes_on_from_a_model(tmp_path: Path) -> None:
+    short = replace(CONFIG, epochs=1)
+    first = fit_networks(TRAINING, VALIDATION, HAND, short)
+    bare = fit_networks(
+        Frames(TRAINING.markers), Frames(VALIDATION.markers), HAND, short, start=first
+    )
+    assert bare.joint_network is first.joint_network
+    assert bare.training["posture"] == first.training["posture"]
+    changed = [
+        np.abs(bare.marker_network.arrays[k] - first.marker_network.arrays[k]).max()
+        for k in first.marker_network.arrays
+    ]
+    assert 0 < max(changed) < 0.2
+    np.testing.assert_array_equal(bare.marker_network.input_mean, first.marker_network.input_mean)
