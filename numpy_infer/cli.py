@@ -19,7 +19,7 @@ from numpy_infer.model import Model, load
 from numpy_infer.pose import Notice, Status, TrackingState
 from numpy_infer.predictors import BASELINES, PREDICTORS
 from numpy_infer.recordings import Recording, load_label_map, read, write
-from numpy_infer.tracking import Tracked, track
+from numpy_infer.tracking import Tracked, prefixed, track, track_hands
 
 VERBS = {
     "train": "train both networks on recordings of hands",
@@ -92,6 +92,15 @@ def parser() -> argparse.ArgumentParser:
         "that fits the labels",
     )
     tracked.add_argument("--right", action="store_true", help="it is a right hand")
+    tracked.add_argument(
+        "--left-prefix", metavar="P", help="what a left hand's labels begin with, such as L_"
+    )
+    tracked.add_argument(
+        "--right-prefix",
+        metavar="P",
+        help="the same of a right hand; with both, two hands are tracked at once and written to "
+        "OUT_left and OUT_right",
+    )
     tracked.add_argument(
         "--predictor", choices=tuple(PREDICTORS), help="instead of the model's; none: fill nothing"
     )
@@ -191,12 +200,15 @@ def describe(recording: Recording) -> dict[str, Any]:
 
 
 def _track(options: argparse.Namespace) -> None:
-    if options.output.exists() and not options.overwrite:
-        raise ValueError(f"{options.output} exists: choose another name, or pass --overwrite")
-    if options.output.exists() and options.output.samefile(options.file):
-        raise ValueError(f"{options.output} is the recording itself: choose another name")
+    outputs = _outputs(options)
+    for output in outputs.values():
+        if output.exists() and not options.overwrite:
+            raise ValueError(f"{output} exists: choose another name, or pass --overwrite")
+        if output.exists() and output.samefile(options.file):
+            raise ValueError(f"{output} is the recording itself: choose another name")
     recording = _read(options)
-    model = _model(options, recording)
+    prefixes = {"left": options.left_prefix, "right": options.right_prefix}
+    model = _model(options, recording, next((p for p in prefixes.values() if p), ""))
     if options.predictor:
         model = replace(model, predictor=options.predictor)
     if options.joints:
@@ -210,12 +222,30 @@ def _track(options: argparse.Namespace) -> None:
         if show:
             print(f"\rtracking {100 * share:3.0f} %", end="", file=sys.stderr, flush=True)
 
-    result = track(recording, model, right=options.right, report=report)
+    hands = [prefixed(recording, prefixes[side] or "", model.hand) for side in outputs]
+    if len(hands) == 1:
+        results = [track(hands[0], model, right="right" in outputs, report=report)]
+    else:
+        sides = [side == "right" for side in outputs]
+        results = track_hands(hands, model, right=sides, report=report)
     if show:
         print(file=sys.stderr)
-    write(result.recording, options.output, overwrite=options.overwrite)
-    print(_summary(result))
-    print(f"wrote {options.output}")
+    for (side, output), result in zip(outputs.items(), results, strict=True):
+        write(result.recording, output, overwrite=options.overwrite)
+        if len(outputs) > 1:
+            print(f"{side} hand")
+        print(_summary(result))
+        print(f"wrote {output}")
+
+
+def _outputs(options: argparse.Namespace) -> dict[str, Path]:
+    """The file to write of each side that is tracked."""
+    out: Path = options.output
+    if options.left_prefix and options.right_prefix:
+        return {side: out.with_stem(f"{out.stem}_{side}") for side in ("left", "right")}
+    if options.right and options.left_prefix:
+        raise ValueError("--right goes with --right-prefix, not with --left-prefix")
+    return {"right" if options.right or options.right_prefix else "left": out}
 
 
 def _summary(result: Tracked) -> str:
@@ -239,21 +269,22 @@ def _summary(result: Tracked) -> str:
     return "\n".join(lines)
 
 
-def _model(options: argparse.Namespace, recording: Recording) -> Model:
+def _model(options: argparse.Namespace, recording: Recording, prefix: str) -> Model:
     if options.model in BASELINES:
-        return Model(_fitting_hand(options.hand, recording), predictor=options.model)
+        labels = [n.removeprefix(prefix) for n in recording.names if n.startswith(prefix)]
+        return Model(_fitting_hand(options.hand, labels), predictor=options.model)
     if options.hand:
         raise ValueError("--hand goes with a baseline; a model file brings its own hand")
     return load(options.model)
 
 
-def _fitting_hand(name: str | None, recording: Recording) -> Hand:
+def _fitting_hand(name: str | None, labels: Sequence[str]) -> Hand:
     if name:
         return load_hand(name)
-    fits = [hand for hand in bundled() if set(load_hand(hand).markers) <= set(recording.names)]
+    fits = [hand for hand in bundled() if set(load_hand(hand).markers) <= set(labels)]
     if not fits:
         raise ValueError(
-            f"no bundled hand fits the labels {', '.join(recording.names)}: name one with --hand, "
+            f"no bundled hand fits the labels {', '.join(labels)}: name one with --hand, "
             "and rename labels with --map"
         )
     return max(map(load_hand, fits), key=len)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 
 from numpy_infer import HandTracker, Model, Status, TrackingState, load_hand, wearer
 from numpy_infer.cli import describe, main, parser
+from numpy_infer.geometry import mirror
 from numpy_infer.recordings import Recording, read, write
-from numpy_infer.tracking import track
+from numpy_infer.tracking import prefixed, track, track_hands
 
 HAND = load_hand("glove9")
 
@@ -75,6 +77,59 @@ def test_frames_before_the_hand_was_tracked_stay_empty() -> None:
     assert np.isnan(tracked.recording.markers[:7]).all()
     assert np.isfinite(tracked.recording.markers[7:]).all()
     assert (tracked.state[:7] == TrackingState.LOST).all()
+
+
+def both_hands() -> Recording:
+    """A left hand and, beside it, a right one that comes later and goes earlier."""
+    left = recording_with_gaps()
+    right = mirror(left.markers[::-1]) + np.array([0.4, 0, 0])
+    right[:20] = right[100:] = np.nan
+    names = [f"{side}_{name}" for side in "LR" for name in HAND.markers]
+    both = np.concatenate([left.markers, right], 1)
+    return Recording(names, both, TIME, 60.0, "made up", filled=("L_wrist",))
+
+
+def test_two_hands_are_tracked_as_each_alone() -> None:
+    hands = [prefixed(both_hands(), prefix, HAND) for prefix in ("L_", "R_")]
+    assert hands[0].filled == ("wrist",)
+    together = track_hands(hands, Model(HAND), right=[False, True])
+    for one, hand, right in zip(together, hands, (False, True), strict=True):
+        alone = track(hand, Model(HAND), right=right)
+        np.testing.assert_allclose(one.recording.markers, alone.recording.markers, atol=1e-9)
+        np.testing.assert_array_equal(one.status, alone.status)
+        np.testing.assert_array_equal(one.state, alone.state)
+    assert np.isnan(together[1].recording.markers[:20]).all()
+    with pytest.raises(ValueError, match="a side for each hand"):
+        track_hands(hands, Model(HAND), right=[True])
+    with pytest.raises(ValueError, match="same time"):
+        track_hands([hands[0], replace(hands[1], time=TIME + 1)], Model(HAND), right=[False, True])
+
+
+def test_the_command_tracks_both_hands_of_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write(both_hands(), tmp_path / "both.csv")
+    arguments = ["track", str(tmp_path / "both.csv"), "--model", "affine"]
+    out = ["-o", str(tmp_path / "out.csv")]
+    both = ["--left-prefix", "L_", "--right-prefix", "R_"]
+    assert main([*arguments, *out, *both]) == 0
+    assert "right hand" in capsys.readouterr().out
+    for side, right in (("left", False), ("right", True)):
+        prefix = side[0].upper() + "_"
+        alone = track(prefixed(both_hands(), prefix, HAND), Model(HAND), right=right)
+        written = read(tmp_path / f"out_{side}.csv")
+        assert written.names == HAND.markers
+        np.testing.assert_allclose(written.markers, alone.recording.markers, atol=1e-5)
+    assert main([*arguments, *out, *both]) == 2, "nothing is overwritten unasked"
+    one = ["-o", str(tmp_path / "one.csv"), "--right-prefix", "R_"]
+    assert main([*arguments, *one]) == 0
+    assert (
+        read(tmp_path / "one.csv").markers[50] == read(tmp_path / "out_right.csv").markers[50]
+    ).all()
+    assert (
+        main([*arguments, *one[:1], str(tmp_path / "x.csv"), "--right", "--left-prefix", "L_"]) == 2
+    )
+    assert main([*arguments, *one[:1], str(tmp_path / "x.csv"), "--left-prefix", "Q_"]) == 2
 
 
 def test_a_wrong_shape_raises_and_wrong_data_do_not() -> None:
