@@ -81,6 +81,21 @@ def hand(arguments: list[str]) -> int:
     return _told("hand", lambda: glove.describe_glove(config))
 
 
+def occlusions(arguments: list[str]) -> int:
+    """`jaxhand occlusions`."""
+    from jaxhand import occlusions
+
+    description = (
+        "Counts gaps: how many markers of a hand are hidden at once, which, and for how long, one "
+        "hand beside two. Training can hide markers in these proportions.\n\n"
+        "Examples: jaxhand occlusions take.trc --json gaps.json --picture gaps.png\n"
+        "jaxhand occlusions both.c3d --left-prefix L_ --right-prefix R_\n"
+        "jaxhand occlusions simulated"
+    )
+    config = _parsed(occlusions.OcclusionsConfig, arguments, "jaxhand occlusions", description)
+    return _told("occlusions", lambda: occlusions.occlusions(config))
+
+
 def _parsed(config: type[Config], arguments: list[str], prog: str, description: str) -> Config:
     import tyro
 

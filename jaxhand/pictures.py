@@ -154,6 +154,41 @@ def stream_picture(
     _save(figure, path)
 
 
+def occlusions_picture(
+    tables: Mapping[str, Any], path: str | Path, *, overwrite: bool = False
+) -> None:
+    """Draws how many markers are hidden at once, and for how long (paper, Fig. 13 and 14).
+
+    Args:
+        tables: `occlusions.Occlusions` by name, such as one hand and two hands.
+        path: the picture; its ending is the format.
+        overwrite: replace the file if there is one.
+
+    Raises:
+        ValueError: the file exists, or matplotlib is missing.
+    """
+    from jaxhand.occlusions import QUANTILES
+
+    figure = _figure(path, overwrite, (10, 3.6))
+    number, duration = figure.subplots(1, 2)
+    width = 0.8 / len(tables)
+    for i, (name, table) in enumerate(tables.items()):
+        colour = (OUTPUT, FILLED, BONE)[i % 3]
+        places = np.arange(len(table.hidden)) + width * (i - (len(tables) - 1) / 2)
+        number.bar(places, table.hidden, width, color=colour, label=name)
+        edges = 2.0 ** np.arange(len(table.histogram) + 1) / table.rate
+        most = table.lengths[QUANTILES.index(0.9)] / table.rate
+        label = f"{name}: 90 % within {most:.2f} s"
+        shares = np.array(table.histogram) / max(table.gaps, 1)
+        duration.stairs(shares, edges, color=colour, linewidth=2, label=label)
+    number.set(xlabel="markers hidden at once", ylabel="share of frames", yscale="log")
+    duration.set(xlabel="gap (s)", ylabel="share of gaps", xscale="log", yscale="log")
+    for panel in (number, duration):
+        panel.spines[["top", "right"]].set_visible(False)
+        panel.legend(frameon=False, fontsize=10)
+    _save(figure, path)
+
+
 def _figure(path: str | Path, overwrite: bool, inches: tuple[float, float]) -> Any:
     if Path(path).exists() and not overwrite:
         raise ValueError(f"{path} exists: choose another name, or ask to overwrite it")

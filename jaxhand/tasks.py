@@ -18,6 +18,7 @@ import numpy as np
 from jaxhand import simulation
 from jaxhand.geometry import kabsch, untransform
 from jaxhand.networks import arrays_of, build, predict
+from jaxhand.occlusions import FEWEST_LEFT, Occlusions, draw
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, Hand
@@ -58,10 +59,6 @@ class Task(NamedTuple):
     """Weights → validation loss, and mean error in metres."""
 
 
-FEWEST_LEFT = 3
-"""Markers that are never hidden: fewer do not determine a registration."""
-
-
 @jax.jit
 def draw_visible(key: Array, occlusions: Array, seen: Array) -> Array:
     """`[N, M]` False at the markers to hide, and where `seen [N, M]` is: k of those seen with
@@ -82,11 +79,17 @@ def register(template: Array, markers: Array, weight: Array) -> Array:
     return untransform(*kabsch(template, markers, weight, eye), markers)
 
 
-def occlude(key: Array, markers: Array, template: Array, occlusions: Array) -> tuple[Array, Array]:
+def occlude(
+    key: Array, markers: Array, template: Array, occlusions: Array | Occlusions
+) -> tuple[Array, Array]:
     """Hides markers. Gives `[N, M]` visible, and `[N, M, 3]` all markers as registered by them, NaN
     where not measured."""
     seen = jnp.isfinite(markers).all(-1)
-    visible = draw_visible(key, occlusions, seen)
+    if isinstance(occlusions, Occlusions):
+        drawn = seen & draw(key, occlusions, seen.shape)
+        visible = jnp.where(drawn.sum(-1, keepdims=True) >= FEWEST_LEFT, drawn, seen)
+    else:
+        visible = draw_visible(key, occlusions, seen)
     registered = register(
         template, jnp.where(seen[..., None], markers, 0), visible.astype(markers.dtype)
     )
@@ -98,7 +101,7 @@ def _occluded_inputs(
     markers: Array,
     hand: Hand,
     simulated: float,
-    occlusions: Array,
+    occlusions: Array | Occlusions,
     network: Network,
 ) -> tuple[Array, Array]:
     if simulated:
@@ -144,7 +147,7 @@ def marker_task(
     hand: Hand,
     key: Array,
     hidden: Spec,
-    occlusions: tuple[float, ...],
+    occlusions: tuple[float, ...] | Occlusions,
     start: Network | None = None,
 ) -> Task:
     """The marker network: registered visible markers → all markers, in the same frame.
@@ -154,17 +157,18 @@ def marker_task(
     """
     template = jnp.asarray(hand.template, jnp.float32)
     markers, held_out = (jnp.asarray(x.markers, jnp.float32) for x in (training, validation))
-    probabilities = jnp.asarray(occlusions, jnp.float32)
+    known = isinstance(occlusions, Occlusions)
+    how = occlusions if known else jnp.asarray(occlusions, jnp.float32)
     network = start or _new_marker_network(markers, hand, key, hidden)
     hide = partial(
         _occluded_inputs,
         hand=hand,
         simulated=training.simulated,
-        occlusions=probabilities,
+        occlusions=how,
         network=replace(network, arrays={}),
     )
     # The same masks whatever the seed, so that losses of different runs can be compared.
-    visible, truth = occlude(jax.random.key(0), held_out, template, probabilities)
+    visible, truth = occlude(jax.random.key(0), held_out, template, how)
     whole = bool(np.isfinite(training.markers).all())
     return Task(
         name="marker_network",

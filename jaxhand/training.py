@@ -25,10 +25,10 @@ from rich.console import Console
 from jaxhand import runs
 from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
+from jaxhand.occlusions import FEWEST_LEFT, Occlusions, of_layout
 from jaxhand.options import DataSets, Layers, Takes
 from jaxhand.sparse_fit import prior_of
 from jaxhand.tasks import (
-    FEWEST_LEFT,
     Augmentation,
     Frames,
     Task,
@@ -91,8 +91,9 @@ class TrainingConfig:
     paper_joints: bool = False
     """Train the joint network by the paper's plain recipe instead: layers 200,0.1,200,0.1,200, the
     mean square of the angles, frames as they were recorded."""
-    occlusions: tuple[float, ...] = (0.70, 0.17, 0.08, 0.05)
-    """Probabilities that 1, 2, 3, … markers are hidden."""
+    occlusions: tuple[float, ...] | str = (0.70, 0.17, 0.08, 0.05)
+    """Probabilities that 1, 2, 3, … markers are hidden, any of them alike; or a file of `jaxhand
+    occlusions --json`: as many as there, and those that were missing more often more often."""
     batch: int = 32
     """Frames a step."""
     learning_rate: float = 1e-3
@@ -119,8 +120,9 @@ class TrainingConfig:
                 raise ValueError(f"{name}: expected 1 or more, found {getattr(self, name)}")
         if not 0 < self.learning_rate < math.inf:
             raise ValueError(f"learning_rate: expected above 0, found {self.learning_rate}")
-        if min(self.occlusions, default=-1) < 0 or abs(sum(self.occlusions) - 1) > 1e-6:
-            raise ValueError(f"occlusions: expected parts that sum to 1, found {self.occlusions}")
+        parts = (1.0,) if isinstance(self.occlusions, str) else self.occlusions
+        if min(parts, default=-1) < 0 or abs(sum(parts) - 1) > 1e-6:
+            raise ValueError(f"occlusions: expected parts that sum to 1, found {parts}")
         if not 0 <= self.position_weight < math.inf:
             raise ValueError(f"position_weight: expected 0 or more, found {self.position_weight}")
         if not (self.mixed >= 0 and self.drawn >= 0 and self.mixed + self.drawn <= 1):
@@ -287,6 +289,11 @@ def fit_networks(
         training, validation = (x._replace(angles=None) for x in (training, validation))
     _check_frames("training", training, hand, config.batch)
     _check_frames("validation", validation, hand, 1)
+    occlusions: tuple[float, ...] | Occlusions
+    if isinstance(config.occlusions, str):
+        occlusions = of_layout(config.occlusions, hand.markers)
+    else:
+        occlusions = config.occlusions
     tasks = [
         partial(
             marker_task,
@@ -294,7 +301,7 @@ def fit_networks(
             validation,
             hand,
             hidden=config.marker_layers,
-            occlusions=config.occlusions,
+            occlusions=occlusions,
             start=start.marker_network if start else None,
         )
     ]

@@ -9,8 +9,9 @@ import numpy as np
 
 from jaxhand import simulation
 from jaxhand.datasets import Split, load, parse_spec
+from jaxhand.occlusions import FEWEST_LEFT
 from jaxhand.sequences import RATE, Dataset, Sequence
-from jaxhand.tasks import FEWEST_LEFT, Frames
+from jaxhand.tasks import Frames
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, Hand, load_hand
 from numpy_infer.model import Model

@@ -16,6 +16,7 @@ import numpy as np
 from numpy_infer import wearer
 from numpy_infer.hand import Hand, bundled, load_hand
 from numpy_infer.model import Model, load
+from numpy_infer.model import bundled as bundled_models
 from numpy_infer.pose import Notice, Status, TrackingState
 from numpy_infer.predictors import BASELINES, PREDICTORS
 from numpy_infer.recordings import Recording, load_label_map, read, write
@@ -26,6 +27,7 @@ VERBS = {
     "evaluate": "measure a model beside the baselines (the paper's Table 3)",
     "calibrate": "find the bones of whoever wears the glove, for the tracker",
     "hand": "describe a new glove out of a recording, as a hand file",
+    "occlusions": "count the gaps of recordings: how many markers at once, and how long",
     "demo": "the whole line on simulated hands, in a few minutes and with no data",
 }
 """Verbs of the JAX side, found through the entry points `jaxhand.verbs`."""
@@ -81,9 +83,9 @@ def parser() -> argparse.ArgumentParser:
     _add_file(tracked)
     tracked.add_argument(
         "--model",
-        required=True,
         metavar="M",
-        help=f"a model file, or a baseline that needs none: {', '.join(BASELINES)}",
+        help=f"a model file, a bundled model ({', '.join(bundled_models())}; default the one that "
+        f"fits the labels), or a baseline: {', '.join(BASELINES)}",
     )
     tracked.add_argument("-o", "--output", required=True, type=Path, help="OUT.trc, .tsv or .csv")
     tracked.add_argument(
@@ -270,12 +272,18 @@ def _summary(result: Tracked) -> str:
 
 
 def _model(options: argparse.Namespace, recording: Recording, prefix: str) -> Model:
+    labels = [n.removeprefix(prefix) for n in recording.names if n.startswith(prefix)]
     if options.model in BASELINES:
-        labels = [n.removeprefix(prefix) for n in recording.names if n.startswith(prefix)]
         return Model(_fitting_hand(options.hand, labels), predictor=options.model)
     if options.hand:
-        raise ValueError("--hand goes with a baseline; a model file brings its own hand")
-    return load(options.model)
+        raise ValueError("--hand goes with a baseline; a model brings its own hand")
+    if options.model:
+        return load(options.model)
+    name = _fitting_hand(None, labels).name
+    if name not in bundled_models():
+        raise ValueError(f"no model is bundled for {name}: name one with --model")
+    print(f"tracked by the bundled model {name}")
+    return load(name)
 
 
 def _fitting_hand(name: str | None, labels: Sequence[str]) -> Hand:

@@ -10,6 +10,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib import resources
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ import numpy as np
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, Hand, hand_from_json
 from numpy_infer.networks import Network, array_shapes, read_spec, write_spec
+
+_WEIGHTS = resources.files("numpy_infer") / "weights"
 
 FORMAT, VERSION = "jaxhand-model", 1
 
@@ -139,18 +142,26 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
     os.replace(part, path)
 
 
+def bundled() -> tuple[str, ...]:
+    """Names of the models that come with the package, each for the bundled hand of that name."""
+    return tuple(sorted(f.name[:-4] for f in _WEIGHTS.iterdir() if f.name.endswith(".npz")))
+
+
 def load(path: str | Path) -> Model:
-    """Reads a model file.
+    """Reads a model file, or a bundled model by its name (`glove9`).
 
     Raises:
         ValueError: not a model file, another version, a missing, extra, misshapen or corrupted
             array; the message names the file and the culprit.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        file = _WEIGHTS / f"{path}.npz" if str(path) in bundled() else Path(path)
+        with file.open("rb") as stream, zipfile.ZipFile(stream) as archive:
             return _read(archive)
     except FileNotFoundError:
-        raise ValueError(f"no model file {path}") from None
+        raise ValueError(
+            f"no model file {path}, and none of the bundled: {', '.join(bundled())}"
+        ) from None
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: {error}") from None
     except _DAMAGE as error:

@@ -446,7 +446,7 @@ def _leading(condition: Array, values: Array) -> Array:
 class HandTracker:
     """One hand, or several of one model, frame by frame: `init` and `step` with the state inside.
 
-    `tracker = HandTracker.load("model.npz"); pose = tracker.step(markers, dt)`
+    `tracker = HandTracker.load("glove9"); pose = tracker.step(markers, dt)`
     """
 
     def __init__(self, model: Model, *, right: bool | Sequence[bool] = False) -> None:
@@ -462,14 +462,15 @@ class HandTracker:
     @classmethod
     def load(
         cls,
-        path: str | Path,
+        path: str | Path = "glove9",
         *,
         calibration: str | Path | None = None,
         alignment: bool = False,
         right: bool | Sequence[bool] = False,
     ) -> HandTracker:
-        """A tracker that runs a model file, for whoever a calibration file describes; with
-        `alignment` fingers are turned towards their markers, which takes half as long again.
+        """A tracker that runs a model file or, by its name, a bundled model (`model.bundled`), for
+        whoever a calibration file describes; with `alignment` fingers are turned towards their
+        markers, which takes half as long again.
 
         Raises:
             ValueError: a file is not what it should be, or damaged; see `model.load` and

@@ -13,6 +13,7 @@ import pytest
 pytest.importorskip("matplotlib")
 
 from jaxhand import pictures
+from jaxhand.occlusions import Occlusions, statistics
 from numpy_infer.hand import POINTS, flat_points, load_hand
 from numpy_infer.model import Model
 from numpy_infer.pose import HandPose
@@ -95,7 +96,23 @@ def test_a_stream_without_joints_is_refused(tmp_path: Path) -> None:
         pictures.stream_picture(**given, path=tmp_path / "s.png")
 
 
-@pytest.mark.parametrize("which", ["table3", "stream"])
+def gaps() -> dict[str, Occlusions]:
+    """Every tenth frame of a marker missing, of one hand and of two."""
+    seen = np.arange(300)[:, None] % 10 > np.arange(3)
+    return {
+        "one hand": statistics(("a", "b", "c"), 60.0, [seen]),
+        "none": statistics(("a", "b", "c"), 60.0, [np.ones_like(seen)]),
+    }
+
+
+def test_gaps_are_drawn_and_so_is_their_absence(tmp_path: Path) -> None:
+    pictures.occlusions_picture(gaps(), tmp_path / "g.svg")
+    text = (tmp_path / "g.svg").read_text("utf-8")
+    assert "markers hidden at once" in text
+    assert "one hand: 90 % within" in text
+
+
+@pytest.mark.parametrize("which", ["table3", "stream", "gaps"])
 def test_nothing_is_replaced_unasked(tmp_path: Path, which: str) -> None:
     path = tmp_path / "p.png"
     path.write_text("precious")
@@ -103,6 +120,8 @@ def test_nothing_is_replaced_unasked(tmp_path: Path, which: str) -> None:
     def draw(**options: Any) -> None:
         if which == "table3":
             pictures.table_picture(table(affine=1.0), path, **options)
+        elif which == "gaps":
+            pictures.occlusions_picture(gaps(), path, **options)
         else:
             pictures.stream_picture(**stream(), path=path, **options)
 

@@ -15,6 +15,7 @@ import tyro
 
 from jaxhand.demo import DemoConfig
 from jaxhand.glove import CalibrateConfig, HandConfig
+from jaxhand.occlusions import OcclusionsConfig
 from jaxhand.report import EvaluationConfig
 from jaxhand.training import TrainingConfig
 from numpy_infer import Model, load_hand
@@ -29,6 +30,7 @@ CONFIGS = {
     "evaluate": EvaluationConfig,
     "calibrate": CalibrateConfig,
     "hand": HandConfig,
+    "occlusions": OcclusionsConfig,
     "demo": DemoConfig,
 }
 

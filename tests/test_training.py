@@ -17,6 +17,7 @@ from strategies import HIGH, LOW, turn  # noqa: E402
 
 from jaxhand import cli, options, runs, tasks, training, training_data  # noqa: E402
 from jaxhand.networks import predict  # noqa: E402
+from jaxhand.occlusions import save, statistics  # noqa: E402
 from jaxhand.sequences import Dataset, Sequence  # noqa: E402
 from jaxhand.skeleton import (  # noqa: E402
     forward_kinematics,
@@ -552,3 +553,24 @@ def test_a_training_goes_on_from_a_model(tmp_path: Path) -> None:
     ]
     assert 0 < max(changed) < 0.2
     np.testing.assert_array_equal(bare.marker_network.input_mean, first.marker_network.input_mean)
+
+
+def test_gaps_that_were_counted_are_hidden_in_the_same_proportions(tmp_path: Path) -> None:
+    # Two of the first three markers, or the last alone, three times as often.
+    seen = np.ones((400, 9), bool)
+    seen[:100, :2] = False
+    seen[100:, 8] = False
+    table = statistics(HAND.markers, 60.0, [seen])
+    template = HAND.template.astype(np.float32)
+    markers = np.repeat(np.asarray(TRAINING.markers), 20, 0)
+    visible, _ = tasks.occlude(jax.random.key(0), markers, template, table)
+    hidden = ~np.asarray(visible)
+    assert (hidden.sum(-1) == 2).mean() == pytest.approx(0.25, abs=0.02)
+    assert hidden.sum(-1).min() == 1
+    assert hidden[:, 8].mean() > 2 * hidden[:, 0].mean()
+    assert not hidden[:, 3:8].any()
+    save({"one hand": table}, tmp_path / "gaps.json")
+    config = replace(CONFIG, occlusions=str(tmp_path / "gaps.json"), joints=False, epochs=1)
+    assert fit_networks(TRAINING, VALIDATION, HAND, config).marker_network is not None
+    with pytest.raises(ValueError, match="gaps"):
+        fit_networks(TRAINING, VALIDATION, HAND, replace(config, occlusions="no_gaps.json"))
