@@ -21,7 +21,7 @@ def main() -> None:
     parser.add_argument("hands", nargs="*", default=bundled(), help="default: all bundled hands")
     parser.add_argument("--runs", type=Path, default=Path("runs"), help="folder of the run folders")
     parser.add_argument("--out", type=Path, default=WEIGHTS, help="folder of the models")
-    parser.add_argument("--epochs", type=int, default=100, help="at most, of each network")
+    parser.add_argument("--epochs", type=int, default=150, help="at most, of each network")
     options = parser.parse_args()
     for hand in options.hands:
         run = options.runs / f"bundled_{hand}"

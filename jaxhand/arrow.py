@@ -46,12 +46,12 @@ TURN_SCALE, SHIFT_SCALE = 0.1, 0.05
 POSTURES = {
     "thumb_cmc_flexion": (15, 20),
     "thumb_cmc_abduction": (5, 20),
-    "thumb_cmc_twist": (0, 10),
+    "thumb_cmc_twist": (-20, 25),
     "thumb_mcp_flexion": (12, 20),
     "thumb_ip_flexion": (15, 25),
     "mcp_flexion": (30, 35),
     "mcp_abduction": (0, 10),
-    "mcp_twist": (0, 6),
+    "mcp_twist": (0, 10),
     "pip_flexion": (40, 35),
     "dip_flexion": (0, 10),
 }

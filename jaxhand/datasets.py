@@ -86,6 +86,8 @@ class Reading(NamedTuple):
 
     unit: float | None = None
     left_handed: bool = False
+    truth: Path | bool = False
+    """See `load`."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,7 @@ def load(
     takes: tuple[str, ...] | None = None,
     unit: float | None = None,
     left_handed: bool = False,
+    truth: Path | bool = False,
 ) -> Dataset:
     """Reads one split of a data set. Only that split's files need to be there.
 
@@ -138,6 +141,8 @@ def load(
         hand: the markers wanted; default the data set's own, see `SOURCES`.
         takes: instead of the split: takes (ManipNet), users (SIG18), file stems (the others).
         unit, left_handed: for `recordings` whose files do not say, see `recordings.read`.
+        truth: fit joint truth to recordings that hold none but have the markers for it (SIG18; some
+            two minutes for each user); a folder: and keep it there, or take it from there.
 
     Raises:
         ValueError: an unknown data set, split, take or user, with those that there are; a path that
@@ -162,7 +167,7 @@ def load(
         )
     hand = load_hand(source.hand) if hand is None else hand
     paths = tuple(path for take in dict.fromkeys(chosen) for path in files[take])
-    dataset = source.read(paths, hand, Reading(unit, left_handed))
+    dataset = source.read(paths, hand, Reading(unit, left_handed, truth))
     return replace(dataset, name=spec.name, weight=spec.weight)
 
 
@@ -188,7 +193,9 @@ def _measured(
     for path in paths:
         labels = path.parent / LABELS
         label_map = load_label_map(labels) if labels.exists() else None
-        recording = read(path, label_map=label_map, **reading._asdict())
+        recording = read(
+            path, label_map=label_map, unit=reading.unit, left_handed=reading.left_handed
+        )
         take, named = _without_side(path.stem)
         sequences.append(_sequence(recording, hand, take, side or named))
     return Dataset("", hand, tuple(sequences))
@@ -213,21 +220,37 @@ SIG18_AS_GLOVE9 = {
 }
 
 
-def _sig18(paths: tuple[Path, ...], hand: Hand, _: Reading) -> Dataset:
+def _sig18(paths: tuple[Path, ...], hand: Hand, reading: Reading) -> Dataset:
     """Its authors added white noise of 1.5-1.8 mm, so it is smoothed at its own 120 Hz."""
-    sequences = []
+    dense, names = load_hand("dense19"), list(hand.markers)
+    sequences: list[Sequence] = []
+    people: dict[str, list[Array]] = {}
     for path in paths:
         recording = read(path)
         if (len(recording.time) + 1) // 2 < MIN_FRAMES:
             continue
-        if not set(hand.markers) <= set(recording.names):
-            recording = recording.rename(SIG18_AS_GLOVE9)
         recording = replace(recording, markers=smooth(recording.markers))
         stem, side = _without_side(path.stem)
         take = "/".join((*path.parts[-3:-1], stem.removesuffix("_training_dense")))
+        if reading.truth is not False:
+            everything = _sequence(recording, dense, take, side)
+            people.setdefault(path.parts[-3], []).append(everything.markers)
+        if not set(names) <= set(recording.names):
+            recording = recording.rename(SIG18_AS_GLOVE9)
         sequences.append(_sequence(recording, hand, take, side))
     note = f"Savitzky-Golay 9, order 2; shorter than {MIN_FRAMES} frames at {RATE:g} Hz left out"
-    return Dataset("", hand, tuple(sequences), notes=(note,))
+    dataset = Dataset("", hand, tuple(sequences), notes=(note,))
+    if reading.truth is False:
+        return dataset
+    from jaxhand.dense_truth import with_truth  # not before it is needed: loads jax
+
+    if set(names) <= set(dense.markers):
+        read_as = list(dense.markers)
+    else:
+        read_as = [SIG18_AS_GLOVE9.get(name, name) for name in dense.markers]
+    columns = [read_as.index(name) for name in names]
+    keep = reading.truth if isinstance(reading.truth, Path) else None
+    return with_truth(dataset, dense, people, columns, keep)
 
 
 class _Posed(NamedTuple):

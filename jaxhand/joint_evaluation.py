@@ -52,7 +52,8 @@ class Row(NamedTuple):
 def rows(
     model: Model, dataset: data.Dataset, others: Mapping[str, Model] | None = None
 ) -> dict[str, Row]:
-    """The methods of Table 4 for a model, all with the data set's own bones but one.
+    """The methods of Table 4 for a model, all with the data set's own bones and marker places but
+    one.
 
     `learned` is the pipeline with finger alignment, `learned_uncalibrated` the same on the bones of
     the bundled hand, as somebody has it who never calibrates; `ik` and `ik_tuned` are the paper's
@@ -61,10 +62,10 @@ def rows(
 
     Args:
         model: with both networks.
-        dataset: whose bones are taken.
+        dataset: whose hand is taken.
         others: further models by the name of their row.
     """
-    wearer = model.hand.with_skeleton(dataset.hand.skeleton)
+    wearer = dataset.hand
     learned = replace(model, predictor="learned", joints="learned", alignment=True)
     filled = replace(learned, joints="none")
     found = {
@@ -80,8 +81,7 @@ def rows(
         average = model.hand.with_skeleton(load_hand(model.hand.name).skeleton)
         found["learned_uncalibrated"] = Row(replace(learned, wearer=average))
     for name, other in (others or {}).items():
-        own = other.hand.with_skeleton(dataset.hand.skeleton)
-        found[name] = Row(replace(other, alignment=True, wearer=own))
+        found[name] = Row(replace(other, alignment=True, wearer=wearer))
     return found
 
 
@@ -129,6 +129,20 @@ def table4(
     return table
 
 
+def noise_floor_row(dataset: data.Dataset) -> dict[str, Any]:
+    """What the truth of a data set that was fitted is off by itself, as a row of Table 4 with
+    nothing hidden; the other cells are empty. Blocks are takes."""
+    assert dataset.noise_floor is not None
+    blocks = [off[np.isfinite(off)] for off in dataset.noise_floor.values()]
+    total = 1e2 * np.array([block.sum() for block in blocks])
+    empty = interval(np.zeros(0), np.zeros(0, int))
+    hidden = {f"{duration:.1f}": empty for duration in evaluation.DURATIONS}
+    return {
+        "0": interval(total, np.array([len(block) for block in blocks])),
+        **{str(count): hidden for count in evaluation.COUNTS},
+    }
+
+
 def wrist_errors(
     model: Model, dataset: data.Dataset, seeds: int = evaluation.SEEDS
 ) -> dict[str, dict[str, Cell]]:
@@ -164,9 +178,12 @@ def steadiness(model: Model, dataset: data.Dataset, seed: int = 0) -> dict[str, 
     poses, truth = [], []
     for sequence in dataset.sequences:
         complete = np.isfinite(sequence.markers).all((-1, -2))
-        if complete.all() and len(complete) > 3 and sequence.positions is not None:
+        positions = sequence.positions
+        if positions is None or not np.isfinite(positions).all():
+            continue
+        if complete.all() and len(complete) > 3:
             poses.append(evaluate_poses(model, sequence.markers).positions)
-            truth.append(sequence.positions)
+            truth.append(positions)
     rng = np.random.default_rng(seed)
     shape = (300, len(model.hand), 3)
     still = dataset.sequences[0].markers[0] + STILL_NOISE * rng.standard_normal(shape)
@@ -298,8 +315,9 @@ def _joint_errors(
         size = len(state.tracked)
         markers = evaluation.padded(trials.pose.markers, size)
         found = row.solve(markers)[: len(block)]
-    off = np.linalg.norm(found - truth[trials.last], axis=-1)[:, POINTS]
-    return 1e2 * off.mean(-1), block
+    off = np.linalg.norm(found - truth[trials.last], axis=-1)[:, POINTS].mean(-1)
+    known = np.isfinite(off)  # a frame may have no truth
+    return 1e2 * off[known], block[known]
 
 
 def _wrist_errors(
@@ -316,7 +334,8 @@ def _wrist_errors(
     hidden = np.zeros((len(starts.start), len(model.hand)), bool)
     hidden[:, alignment] = evaluation.hide(rng, len(hidden), len(alignment), count)
     trials, block = evaluation.run_trials(model, state, starts, hidden, duration)
-    return measure(trials.pose, trials.last), block
+    off = measure(trials.pose, trials.last)
+    return off[np.isfinite(off)], block[np.isfinite(off)]
 
 
 def _millimetres(pose: HandPose, position: Array) -> Array:

@@ -39,6 +39,9 @@ class EvaluationConfig:
     """NAME=FILE: a further model's row in Table 4; as often as wanted."""
     test: Takes = ()
     """Takes to test on instead of the data set's default split."""
+    truth: Path | None = None
+    """Folder that keeps joint truth fitted to dense markers (SIG18, some two minutes a user), which
+    Table 4 needs: written if it is not there yet, read if it is."""
     json: Path | None = None
     """Write all figures here."""
     plot: Path | None = None
@@ -76,7 +79,8 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
         raise ValueError(f"expected one --data, found {len(config.data)}: each gets its own table")
     model = None if config.model in BASELINES else load_model(config.model)
     hand = model.hand if model else None
-    dataset = load(config.data[0], "test", hand=hand, takes=config.test or None)
+    truth = config.truth or config.table == 4
+    dataset = load(config.data[0], "test", hand=hand, takes=config.test or None, truth=truth)
     for note in dataset.notes:
         console.print(f"[dim]{note}[/dim]")
     model = model or Model(dataset.hand, predictor=str(config.model))
@@ -118,6 +122,8 @@ def _joints_report(
     rows = joint_evaluation.rows(model, dataset, others)
     with _bars(list(rows), console) as report:
         table = joint_evaluation.table4(rows, dataset, seeds=config.seeds, report=report)
+    if dataset.noise_floor is not None:
+        table["noise_floor"] = joint_evaluation.noise_floor_row(dataset)
     own = rows["learned"].model
     result: dict[str, Any] = {
         "table4": table,

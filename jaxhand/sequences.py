@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -41,13 +42,15 @@ class Sequence:
 class Dataset:
     """Sequences of one hand. hand: with the data's own skeleton where that is known. weight: its
     share in training. observed_angles: `[26]` True where the recordings determine the angle, None
-    without joint truth. notes: one line each."""
+    without joint truth. noise_floor: where that truth is a fit, take → how far it is off by itself,
+    `[N]` metres (see `dense_truth.noise_floor`). notes: one line each."""
 
     name: str
     hand: Hand
     sequences: tuple[Sequence, ...]
     weight: float = 1.0
     observed_angles: Array | None = None
+    noise_floor: Mapping[str, Array] | None = None
     notes: tuple[str, ...] = ()
 
 

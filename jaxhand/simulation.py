@@ -7,12 +7,15 @@ same result; every function is pure, and safe under jit and vmap.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhand.anthropometry import people, placed
+from jaxhand.contact import marked
 from jaxhand.geometry import product
 from jaxhand.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 from numpy_infer.arrays import Array
@@ -235,13 +238,14 @@ def streams(key: Array, hand: Hand, count: int, frames: int, rate: float = 60.0)
 
 def frames(key: Array, hand: Hand, count: int) -> tuple[Array, Array]:
     """Frames that have nothing to do with each other, to train on: markers `[N, M, 3]` metres, hand
-    frame, and angles `[N, 26]` radians. Each is of a person of its own, in a posture or on the way
-    from one to another."""
-    bone_key, pose_key, time_key = jax.random.split(key, 3)
+    frame, and angles `[N, 26]` radians. Each is of a person of its own, with markers on the skin
+    and not quite where they should be, in a posture or on the way from one to another."""
+    who, pose_key, time_key, place = jax.random.split(key, 4)
     before, after = poses(pose_key, (2, count))
     angles = before + minimum_jerk(jax.random.uniform(time_key, (count, 1))) * (after - before)
-    skeleton = bone_lengths(bone_key, hand, (count,))
-    return still_markers(hand, skeleton, angles), angles
+    group = people(who, hand, (count,))
+    worn = replace(hand, offsets=placed(place, hand, group))
+    return marked(worn, group.skeleton, angles, jnp.eye(3), jnp.zeros(3))[0], angles
 
 
 def still_markers(hand: Hand, skeleton: Array, angles: Array) -> Array:

@@ -255,7 +255,7 @@ FINGER_OF_JOINT = (-1, *np.repeat(np.arange(len(FINGERS)), 3).tolist())
 """For each joint of `hand.JOINTS` the index of its finger in `FINGERS`; −1 for the wrist."""
 
 
-@partial(jax.jit, static_argnames="augmentation")
+@partial(jax.jit, static_argnames=("augmentation", "hand"))
 def _joint_frames(
     key: Array,
     frames: tuple[Array, Array],

@@ -64,6 +64,26 @@ def test_rows_stand_on_the_data_sets_bones_but_the_uncalibrated_one(dataset: Dat
     assert "least_squares" not in evaluation.rows(plain, dataset)
 
 
+def test_rows_stand_on_the_data_sets_markers_too(dataset: Dataset) -> None:
+    moved = replace(dataset.hand, offsets=dataset.hand.offsets + 1e-3)
+    worn = replace(dataset, hand=moved.with_skeleton(dataset.hand.skeleton))
+    rows = evaluation.rows(with_posture(dataset), worn, {"other": with_posture(dataset)})
+    for name in ("learned", "other"):
+        np.testing.assert_array_equal(rows[name].model.body.offsets, worn.hand.offsets)
+        np.testing.assert_array_equal(rows[name].model.body.template, worn.hand.template)
+
+
+def test_the_noise_floor_is_a_row_with_nothing_hidden(dataset: Dataset) -> None:
+    floor = {f"take{i}": np.full(30 + i, 2e-3) for i in range(12)}
+    floor["take3"][4] = np.nan
+    row = evaluation.noise_floor_row(replace(dataset, noise_floor=floor))
+    assert row["0"]["mean"] == pytest.approx(0.2)
+    assert row["0"]["low"] == pytest.approx(0.2)
+    assert row["0"]["n"] == sum(map(len, floor.values())) - 1
+    assert {cell["mean"] for count in "1234" for cell in row[count].values()} == {None}
+    assert set(row["4"]) == {"0.1", "0.2", "0.5", "1.0", "2.0"}
+
+
 def test_what_solves_exactly_has_no_error_and_what_errs_has_its_own(dataset: Dataset) -> None:
     truth = np.concatenate([s.positions for s in dataset.sequences])
     frames = np.concatenate([s.markers for s in dataset.sequences])
@@ -83,6 +103,20 @@ def test_what_solves_exactly_has_no_error_and_what_errs_has_its_own(dataset: Dat
     starts = 2 * (FRAMES - 19 - 6)
     assert table["0"]["n"] == -(-starts // evaluation.SOLVED_EVERY)
     json.dumps(table)
+
+
+def test_frames_without_truth_are_left_out(dataset: Dataset) -> None:
+    first, second = dataset.sequences
+    positions = first.positions.copy()
+    positions[30:40] = np.nan
+    holed = replace(dataset, sequences=(replace(first, positions=positions), second))
+    model = replace(a_model("affine", dtype=np.float32), joints="none")
+    still = np.zeros((21, 3), np.float32)
+    row = Row(model, lambda markers: np.broadcast_to(still, (len(markers), 21, 3)))
+    whole, less = (evaluation.table4({"any": row}, d, seeds=1)["any"] for d in (dataset, holed))
+    assert less["0"]["n"] == whole["0"]["n"] - 1
+    assert np.isfinite(less["0"]["mean"])
+    assert less["1"]["0.1"]["n"] < whole["1"]["0.1"]["n"]
 
 
 def test_the_wrist_is_exact_with_nothing_hidden_and_worse_the_more_is(dataset: Dataset) -> None:
