@@ -19,7 +19,7 @@ from jaxhand.datasets import Dataset, load
 from jaxhand.evaluation import COUNTS, DURATIONS, SEEDS, Report, mean_ratio, methods, table3
 from jaxhand.joint_evaluation import joint_errors
 from jaxhand.options import AlsoModels, DataSets, Takes
-from numpy_infer.model import Model
+from numpy_infer.model import Model, bundled
 from numpy_infer.model import load as load_model
 from numpy_infer.predictors import BASELINES
 
@@ -31,7 +31,8 @@ class EvaluationConfig:
     data: DataSets
     """Data set NAME[:PATH]; its test split is taken. One a table."""
     model: str | None = None
-    """A model file of `jaxhand train`, or the name of a baseline for the baselines alone."""
+    """A model file of `jaxhand train`, a bundled model's name (default: the one for the data set's
+    hand), or the name of a baseline for the baselines alone."""
     table: Literal[3, 4] = 3
     """3: hidden markers, and the joints with nothing hidden; 4: the joints while markers are
     hidden, beside inverse kinematics."""
@@ -62,7 +63,7 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
         "joints": {METHOD: {"cm", "deg", "wrist_mm", "wrist_deg": CELL}}}`, see `evaluation`.
 
     Raises:
-        ValueError: no model named, a file that is none or that exists already, no data.
+        ValueError: no model for the hand, a file that is none or that exists already, no data.
     """
     console = console or Console()
     if config.seeds < 1:
@@ -70,19 +71,18 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
     for path in (config.json, config.plot):
         if path is not None and path.exists() and not config.overwrite:
             raise ValueError(f"{path} exists: choose another name, or pass --overwrite")
-    if config.model is None:
-        raise ValueError(
-            "no weights are bundled yet: name a model with --model FILE (jaxhand train makes one), "
-            f"or a baseline: {', '.join(BASELINES)}"
-        )
     if len(config.data) != 1:
         raise ValueError(f"expected one --data, found {len(config.data)}: each gets its own table")
-    model = None if config.model in BASELINES else load_model(config.model)
+    named = config.model is not None and config.model not in BASELINES
+    model = load_model(str(config.model)) if named else None
     hand = model.hand if model else None
     truth = config.truth or config.table == 4
     dataset = load(config.data[0], "test", hand=hand, takes=config.test or None, truth=truth)
     for note in dataset.notes:
         console.print(f"[dim]{note}[/dim]")
+    if config.model is None:
+        model = _bundled_model(dataset)
+        console.print(f"the bundled model {dataset.hand.name}, which has seen simulated hands only")
     model = model or Model(dataset.hand, predictor=str(config.model))
     if config.table == 4:
         result = _joints_report(model, dataset, config, console)
@@ -97,6 +97,16 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
         table_picture(result[f"table{config.table}"], config.plot, overwrite=config.overwrite)
         console.print(f"wrote {config.plot}")
     return result
+
+
+def _bundled_model(dataset: Dataset) -> Model:
+    name = dataset.hand.name
+    if name not in bundled():
+        raise ValueError(
+            f"no model is bundled for {name}: name one with --model FILE (jaxhand train makes "
+            f"one), or a baseline: {', '.join(BASELINES)}"
+        )
+    return load_model(name)
 
 
 def _markers_report(

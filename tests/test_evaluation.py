@@ -140,7 +140,7 @@ def test_a_table_is_the_same_every_time_and_orders_the_methods(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--data", "recordings:DIR"], "no weights are bundled yet"),
+        (["--data", "recordings:DIR"], "holds no takes"),
         (["--data", "recordings:DIR", "--model", "nothing.npz"], "no model file nothing.npz"),
         (["--data", "nowhere:DIR", "--model", "affine"], "nowhere"),
         (["--data", "recordings:DIR", "--model", "affine", "--json", "HERE"], "--overwrite"),
