@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhand.geometry import product
-from jaxhand.simulation import BONE_SPREAD, DIP_SHARE, PERSON_SPREAD
+from jaxhand.motion import DIP_SHARE
+from jaxhand.simulation import BONE_SPREAD, PERSON_SPREAD
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import rotation_from_vector

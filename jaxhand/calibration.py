@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxhand import arrow
 from jaxhand.arrow import Priors, Problem, State
-from jaxhand.simulation import DIP_SHARE
+from jaxhand.motion import DIP_SHARE
 from numpy_infer import geometry
 from numpy_infer import skeleton as runtime
 from numpy_infer.arrays import Array

@@ -16,7 +16,16 @@ import numpy as np
 
 from jaxhand.anthropometry import people, placed
 from jaxhand.contact import marked
-from jaxhand.geometry import product
+from jaxhand.motion import (
+    DIP_SHARE,
+    HOME,
+    TURN_SPREAD,
+    WRIST_MOVE_SECONDS,
+    WRIST_SPREAD,
+    Motion,
+    from_pitch_yaw_roll,
+    minimum_jerk,
+)
 from jaxhand.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, POINTS, Hand
@@ -25,22 +34,10 @@ PERSON_SPREAD, BONE_SPREAD = 0.06, 0.03
 """Standard deviations of the logarithm of a hand's size (Garrett, *The adult human hand*, 1971),
 and of a bone's length beside it."""
 
-DIP_SHARE = 2 / 3
-"""Of a PIP joint's flexion that its DIP joint takes on: one tendon bends both."""
-
 MOVE_SECONDS = (0.2, 1.5)
 """Shortest and longest move from one posture to the next."""
-WRIST_MOVE_SECONDS = (0.8, 2.5)
-"""Shortest and longest move of the wrist."""
 REST_SHARE, REST_SECONDS = 0.5, 0.5
 """Share of moves that a rest follows, and the mean of these rests."""
-
-HOME = (0.0, 1.0, 0.0)
-"""Metres, world: where the wrist is about."""
-WRIST_SPREAD = (0.15, 0.12, 0.15)
-"""Metres: standard deviation of the places it goes to."""
-TURN_SPREAD = (0.5, 0.4, 0.8)
-"""Radians: standard deviation of its pitch, yaw and roll, beside the heading of the stream."""
 
 GAP_SECONDS, GAP_TAIL = 0.1, 0.6
 """Median length of a gap, and how heavy the tail is: 90 % are shorter than 0.37 s (paper, section
@@ -84,26 +81,6 @@ _NEIGHBOURS = np.linalg.cholesky(NEIGHBOUR_CORRELATION**_DISTANCE).astype(np.flo
 """`[4, 4]` makes independent numbers of four fingers correlated ones."""
 _FAN = np.array([1, 0.2, -0.4, -1], np.float32)
 """How far each finger goes towards the thumb as the hand spreads: the middle one hardly."""
-_CROSS = np.array(
-    [
-        [[0, 0, 0], [0, 0, -1], [0, 1, 0]],
-        [[0, 0, 1], [0, 0, 0], [-1, 0, 0]],
-        [[0, -1, 0], [1, 0, 0], [0, 0, 0]],
-    ],
-    np.float32,
-)
-"""Cross-product matrices of the axes x, y, z."""
-
-
-class Motion(NamedTuple):
-    """A hand over time, without its bones."""
-
-    angles: Array
-    """`[..., T, 26]` radians."""
-    wrist_rotation: Array
-    """`[..., T, 3, 3]` world_from_wrist."""
-    wrist_position: Array
-    """`[..., T, 3]` metres, world."""
 
 
 class Streams(NamedTuple):
@@ -189,7 +166,9 @@ def motion(key: Array, frames: int, rate: float, batch: tuple[int, ...] = ()) ->
     heading = jax.random.uniform(heading_key, (*batch, 1), minval=-math.pi, maxval=math.pi)
     return Motion(
         angles=angles,
-        wrist_rotation=_from_pitch_yaw_roll(wrist[..., 3], wrist[..., 4] + heading, wrist[..., 5]),
+        wrist_rotation=from_pitch_yaw_roll(
+            jnp.stack([wrist[..., 3], wrist[..., 4] + heading, wrist[..., 5]], -1)
+        ),
         wrist_position=jnp.array(HOME) + wrist[..., :3],
     )
 
@@ -256,11 +235,6 @@ def still_markers(hand: Hand, skeleton: Array, angles: Array) -> Array:
     return markers(hand, skeleton, angles, eye, jnp.zeros((len(angles), 3)))
 
 
-def minimum_jerk(part: Array) -> Array:
-    """Share of the way that is done after `part` of a move's time, 0 to 1 (Flash & Hogan 1985)."""
-    return part**3 * (10 - 15 * part + 6 * part**2)
-
-
 def _stops(frames: int, rate: float, seconds: tuple[float, float]) -> int:
     """Enough stops even if all moves are of the shortest."""
     return math.ceil(frames / rate / seconds[0]) + 2
@@ -282,18 +256,6 @@ def _travel(key: Array, stops: Array, time: Array, seconds: tuple[float, float])
     before = jnp.take_along_axis(stops, move[..., None], -2)
     after = jnp.take_along_axis(stops, move[..., None] + 1, -2)
     return before + share * (after - before)
-
-
-def _from_pitch_yaw_roll(pitch: Array, yaw: Array, roll: Array) -> Array:
-    """`[..., 3, 3]` world_from_wrist: roll about the hand's z, then pitch about x, yaw about y."""
-    x, y, z = (_turn(axis, angle) for axis, angle in enumerate((pitch, yaw, roll)))
-    return product(product(y, x), z)
-
-
-def _turn(axis: int, angle: Array) -> Array:
-    cross = jnp.asarray(_CROSS[axis])
-    angle = angle[..., None, None]
-    return jnp.eye(3) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * product(cross, cross)
 
 
 def _hidden(draws: Array, rate: float, seen: float) -> tuple[Array, Array]:

@@ -22,6 +22,7 @@ from jaxhand.calibration import (  # noqa: E402
     calibrate,
     new_hand,
 )
+from jaxhand.motion import Motion  # noqa: E402
 from numpy_infer.arrays import Array  # noqa: E402
 from numpy_infer.hand import (  # noqa: E402
     ANGLES,
@@ -61,7 +62,7 @@ class Person(NamedTuple):
 
 
 @functools.cache
-def motions() -> simulation.Motion:
+def motions() -> Motion:
     keys = jax.random.split(jax.random.key(0), STRANGERS)
     move = jax.jit(jax.vmap(lambda key: simulation.motion(key, FRAMES, RATE)))
     return jax.tree.map(lambda array: np.asarray(array, np.float64), move(keys))

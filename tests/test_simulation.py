@@ -10,6 +10,7 @@ import pytest
 jax = pytest.importorskip("jax")
 
 from jaxhand import simulation  # noqa: E402
+from jaxhand.motion import HOME  # noqa: E402
 from jaxhand.simulation import Streams  # noqa: E402
 from numpy_infer.hand import ANGLES, JOINTS, PARENTS, POINTS, TIPS, load_hand  # noqa: E402
 
@@ -144,8 +145,8 @@ def test_nothing_jumps_and_nothing_is_faster_than_a_hand() -> None:
 
 def test_the_wrist_stays_in_the_room() -> None:
     s = streams()
-    assert np.abs(s.wrist_position.mean((0, 1)) - simulation.HOME).max() < 0.1
-    assert np.abs(s.wrist_position - np.array(simulation.HOME)).max() < 1
+    assert np.abs(s.wrist_position.mean((0, 1)) - HOME).max() < 0.1
+    assert np.abs(s.wrist_position - np.array(HOME)).max() < 1
     turned = np.swapaxes(s.wrist_rotation, -1, -2) @ s.wrist_rotation
     np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-5)
 
