@@ -21,7 +21,8 @@ from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, Hand, hand_from_json
 from numpy_infer.networks import Network, array_shapes, read_spec, write_spec
 
-_WEIGHTS = resources.files("numpy_infer") / "weights"
+WEIGHTS = resources.files("numpy_infer") / "weights"
+"""Where the bundled models lie."""
 
 FORMAT, VERSION = "jaxhand-model", 1
 
@@ -144,7 +145,7 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
 
 def bundled() -> tuple[str, ...]:
     """Names of the models that come with the package, each for the bundled hand of that name."""
-    return tuple(sorted(f.name[:-4] for f in _WEIGHTS.iterdir() if f.name.endswith(".npz")))
+    return tuple(sorted(f.name[:-4] for f in WEIGHTS.iterdir() if f.name.endswith(".npz")))
 
 
 def load(path: str | Path) -> Model:
@@ -155,7 +156,7 @@ def load(path: str | Path) -> Model:
             array; the message names the file and the culprit.
     """
     try:
-        file = _WEIGHTS / f"{path}.npz" if str(path) in bundled() else Path(path)
+        file = WEIGHTS / f"{path}.npz" if str(path) in bundled() else Path(path)
         with file.open("rb") as stream, zipfile.ZipFile(stream) as archive:
             return _read(archive)
     except FileNotFoundError:

@@ -13,6 +13,8 @@ from hypothesis import strategies as st
 
 jax = pytest.importorskip("jax")
 
+import strategies as own  # noqa: E402
+
 from jaxhand import cameras, motion  # noqa: E402
 from jaxhand.anthropometry import mean_person  # noqa: E402
 from jaxhand.cameras import Faults, Rig, Spells, Surface  # noqa: E402
@@ -22,7 +24,6 @@ from numpy_infer.skeleton import (  # noqa: E402
     marker_positions,
     rotations_from_angles,
 )
-from tests import strategies as own  # noqa: E402
 
 GLOVE = load_hand("glove9")
 RATE, FRAMES, RECORDINGS = 120.0, 240, 4
