@@ -9,6 +9,7 @@ import pytest
 
 from numpy_infer import HandTracker, TrackingState, load_hand
 from numpy_infer.cli import main
+from numpy_infer.hand import ANGLES
 from numpy_infer.hand import bundled as bundled_hands
 from numpy_infer.model import bundled, load
 from numpy_infer.recordings import Recording, read, write
@@ -77,3 +78,28 @@ def test_on_hands_it_never_saw_it_beats_the_affine_combination(data: str, data_r
     for count, row in learned.items():
         for duration, cell in row.items():
             assert cell["mean"] < affine[count][duration]["mean"]
+
+
+@pytest.mark.parametrize(
+    ("name", "file", "right"),
+    [
+        ("qualisys13", "qualisys/recording.tsv", True),
+        ("dense19", "sig18/User3/capture4/sequence.8_training_dense_left.trc", False),
+        ("dense19", "sig18/User3/capture4/sequence.8_training_dense_right.trc", True),
+    ],
+)
+def test_the_joints_of_real_hands_are_such_as_hands_can_take(
+    name: str, file: str, right: bool, data_root: Path
+) -> None:
+    """A marker on the wrong side of the hand, or the wrong hand, turns joints out of all range."""
+    tracker = HandTracker.load(name, right=right, alignment=True)
+    markers = read(data_root / file).select(tracker.hand.markers).markers[::20]
+    poses = [tracker.step(frame, 1 / 6) for frame in markers]
+    angles = np.degrees(np.array([pose.angles for pose in poses]))
+    low, high = np.transpose([angle.range_deg for angle in ANGLES])
+    beyond = np.maximum(low - angles, angles - high)
+    assert (beyond < 10).mean() > 0.95
+    mirrored = HandTracker.load(name, right=not right, alignment=True)
+    wrong = [mirrored.step(frame, 1 / 6) for frame in markers]
+    angles = np.degrees(np.array([pose.angles for pose in wrong]))
+    assert np.maximum(low - angles, angles - high).mean() > beyond.mean()
