@@ -113,13 +113,6 @@ def penetration(segments: Array, radii: Array, others: Array, other_radii: Array
     return jnp.maximum(radii[..., :, None] + other_radii[..., None, :] - gap, 0)
 
 
-def self_penetration(segments: Array, radii: Array) -> Array:
-    """`[..., P]` metres that capsules of one hand reach into each other, for each of `PAIRS`."""
-    a, b = PAIRS
-    gap = distance(segments[..., a, :, :], segments[..., b, :, :])
-    return jnp.maximum(radii[..., a] + radii[..., b] - gap, 0)
-
-
 def first_clear(candidates: Array, depth: Array) -> Array:
     """`[..., D]` the first of K candidates `[K, ..., D]` whose `depth [K, ...]` is no more than
     `YIELD`, or where there is none the one that is least deep."""

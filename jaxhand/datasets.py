@@ -141,8 +141,8 @@ def load(
         hand: the markers wanted; default the data set's own, see `SOURCES`.
         takes: instead of the split: takes (ManipNet), users (SIG18), file stems (the others).
         unit, left_handed: for `recordings` whose files do not say, see `recordings.read`.
-        truth: fit joint truth to recordings that hold none but have the markers for it (SIG18; some
-            two minutes for each user); a folder: and keep it there, or take it from there.
+        truth: fit joint truth to recordings that hold none but have the markers for it (SIG18;
+            minutes for each user); a folder: and keep it there, or take it from there.
 
     Raises:
         ValueError: an unknown data set, split, take or user, with those that there are; a path that

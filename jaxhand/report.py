@@ -41,7 +41,7 @@ class EvaluationConfig:
     test: Takes = ()
     """Takes to test on instead of the data set's default split."""
     truth: Path | None = None
-    """Folder that keeps joint truth fitted to dense markers (SIG18, some two minutes a user), which
+    """Folder that keeps joint truth fitted to dense markers (SIG18, minutes for each user), which
     Table 4 needs: written if it is not there yet, read if it is."""
     json: Path | None = None
     """Write all figures here."""

@@ -74,8 +74,8 @@ class TrainingConfig:
     validation: Takes = ()
     """Takes (SIG18: users) to validate on instead of the data set's default split."""
     truth: Path | None = None
-    """Fit joint truth to recordings that hold none but have the markers for it (SIG18, some two
-    minutes a user), keep it in this folder, and train the joint network on it."""
+    """Fit joint truth to recordings that hold none but have the markers for it (SIG18,
+    minutes for each user), keep it in this folder, and train the joint network on it."""
     marker_layers: Layers = (Dense(200), Dense(150), Dense(200))
     """Hidden layers of the marker network: units with ReLU, dropouts as parts of 1 (200,0.1,200),
     or a JSON file; a linear layer follows."""
