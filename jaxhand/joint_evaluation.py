@@ -249,20 +249,18 @@ def evaluate_poses(model: Model, markers: Array) -> HandPose:
     """The tracker's output on complete frames `[N, M, 3]`, each as a first frame."""
     model = replace(model, predictor="affine", joints="learned")  # alignment as the model has it
     chunks, size = evaluation.chunked(len(markers))
-    state = tracker.init(model, (size,))
     visible, dt = jnp.ones((size, len(model.hand)), bool), jnp.zeros(size)
     parts = []
     for first in chunks:
         part = markers[first : first + size]
-        pose = _pose(
-            model, state, jnp.asarray(evaluation.padded(part, size), jnp.float32), visible, dt
-        )
+        pose = _pose(model, jnp.asarray(evaluation.padded(part, size), jnp.float32), visible, dt)
         parts.append([np.asarray(array)[: len(part)] for array in pose])
     return HandPose(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 @jax.jit
-def _pose(model: Model, state: Any, markers: Array, visible: Array, dt: Array) -> HandPose:
+def _pose(model: Model, markers: Array, visible: Array, dt: Array) -> HandPose:
+    state = tracker.init(model, (len(markers),))
     return tracker.step(model, state, markers, visible, dt)[1]
 
 

@@ -72,8 +72,10 @@ def collect(config: TrainingConfig) -> Given:
 def simulated_frames(hand: Hand, seed: int) -> tuple[Frames, Frames]:
     """Simulated people in a glove, others in every epoch, and some to validate on."""
     keys = jax.random.split(jax.random.key(seed))
+    # As a whole: operation by operation it is compiled for longer.
+    simulate = jax.jit(simulation.frames, static_argnames=("hand", "count"))
     parts = [
-        simulation.frames(key, hand, count)
+        simulate(key, hand, count)
         for key, count in zip(keys, (POSTURES, POSTURES // 10), strict=True)
     ]
     return Frames(*parts[0], simulated=1.0), Frames(*parts[1])

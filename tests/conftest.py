@@ -35,6 +35,10 @@ settings.register_profile(
 settings.load_profile("jaxhand")
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+# Most of the time goes into compilation. What is compiled is shared between workers and kept for
+# the next run, by the program compiled and JAX's version; `pytest --cache-clear` forgets it.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(REPOSITORY / ".pytest_cache/d/jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 try:
     import jax
 except ModuleNotFoundError:
@@ -68,6 +72,14 @@ def x64(on: bool = True) -> Iterator[None]:
         enable = importlib.import_module("jax.experimental").enable_x64
     with enable(on):
         yield
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """With `pytest -n 2` a file is one worker's: what its tests share is made once."""
+    from xdist.scheduler import LoadFileScheduling
+
+    return LoadFileScheduling(config, log)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import jax
 import numpy as np
+from simulated import quickly, worn
 from streams import a_model
 
 from jaxhand import simulation
+from jaxhand.motion import Motion
 from jaxhand.tasks import register
 from numpy_infer import load_hand
 from numpy_infer.model import Model
@@ -18,11 +21,12 @@ GLOVE = load_hand("glove9")
 FEATURES = 400
 
 
+@functools.cache
 def fitted_model() -> Model:
     """A joint network whose last layer is fitted to simulated postures, on random features."""
-    angles = np.asarray(simulation.poses(jax.random.key(5), (6000,)))
-    skeleton = np.float32(GLOVE.skeleton)
-    markers = np.asarray(simulation.still_markers(GLOVE, skeleton, angles))
+    angles = np.asarray(quickly(simulation.poses, static_argnums=1)(jax.random.key(5), (6000,)))
+    still = np.eye(3, dtype=np.float32), np.zeros(3, np.float32)
+    markers = worn(GLOVE, Motion(angles, *still))[0]
     weight = np.broadcast_to(GLOVE.alignment_weight, markers.shape[:-1])
     inputs = np.asarray(register(np.float32(GLOVE.template), markers, weight))
     inputs = inputs.reshape(len(inputs), -1)

@@ -10,6 +10,8 @@ import pytest
 
 jax = pytest.importorskip("jax")
 
+from simulated import quickly  # noqa: E402
+
 from jaxhand import anthropometry  # noqa: E402
 from jaxhand.anthropometry import People, mean_person, people, placed  # noqa: E402
 from numpy_infer.hand import CHAINS, POINTS, bundled, load_hand  # noqa: E402
@@ -22,7 +24,7 @@ PHALANGES = [p for p in range(1, len(POINTS)) if p not in BASES]
 
 @functools.cache
 def many() -> People:
-    drawn = jax.jit(lambda key: people(key, GLOVE, (COUNT,)))(jax.random.key(0))
+    drawn = quickly(lambda key: people(key, GLOVE, (COUNT,)))(jax.random.key(0))
     return jax.tree.map(np.asarray, drawn)
 
 
@@ -53,12 +55,14 @@ def test_all_bundled_hands_have_one_mean_person() -> None:
 
 
 def test_the_same_key_gives_the_same_people_in_any_batch() -> None:
-    first, again = (people(jax.random.key(1), GLOVE, (2, 3)) for _ in range(2))
+    draw = quickly(lambda key: people(key, GLOVE, (2, 3)))
+    first, again = (draw(jax.random.key(1)) for _ in range(2))
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a, b)
         assert a.dtype == np.float32
         assert np.isfinite(a).all()
-    assert people(jax.random.key(1), GLOVE).skeleton.shape == (len(POINTS), 3)
+    one = jax.eval_shape(lambda key: people(key, GLOVE), jax.random.key(1))
+    assert one.skeleton.shape == (len(POINTS), 3)
 
 
 def test_hands_vary_as_the_survey_says() -> None:
@@ -145,9 +149,10 @@ def test_a_marker_is_misplaced_along_the_skin() -> None:
 def test_placed_offsets_are_worn_by_a_hand() -> None:
     from jaxhand.skeleton import marker_positions
 
-    offsets = placed(jax.random.key(2), DENSE, people(jax.random.key(3), DENSE, (4,)))
+    group = quickly(lambda key: people(key, DENSE, (4,)))(jax.random.key(3))
+    offsets = quickly(lambda key: placed(key, DENSE, group))(jax.random.key(2))
     worn = replace(DENSE, offsets=offsets[:, None])
     positions = np.zeros((4, 7, len(POINTS), 3), np.float32)
     rotations = np.broadcast_to(np.eye(3, dtype=np.float32), (4, 7, 16, 3, 3))
-    markers = marker_positions(worn, positions, rotations)
+    markers = quickly(lambda: marker_positions(worn, positions, rotations))()
     np.testing.assert_allclose(markers, np.broadcast_to(offsets[:, None], markers.shape))

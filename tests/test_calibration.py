@@ -12,6 +12,7 @@ import pytest
 
 jax = pytest.importorskip("jax")
 
+from simulated import quickly  # noqa: E402
 from strategies import turn  # noqa: E402
 
 from jaxhand import arrow, simulation  # noqa: E402
@@ -61,10 +62,13 @@ class Person(NamedTuple):
     markers: Array
 
 
+bone_lengths = quickly(simulation.bone_lengths, static_argnums=1)
+
+
 @functools.cache
 def motions() -> Motion:
     keys = jax.random.split(jax.random.key(0), STRANGERS)
-    move = jax.jit(jax.vmap(lambda key: simulation.motion(key, FRAMES, RATE)))
+    move = quickly(jax.vmap(lambda key: simulation.motion(key, FRAMES, RATE)))
     return jax.tree.map(lambda array: np.asarray(array, np.float64), move(keys))
 
 
@@ -72,7 +76,7 @@ def person(
     number: int, hand: Hand = DENSE, still: bool = False, bones: Array | None = None
 ) -> Person:
     if bones is None:
-        bones = simulation.bone_lengths(jax.random.key(number), hand)
+        bones = bone_lengths(jax.random.key(number), hand)
     random = np.random.default_rng(number)
     offsets = hand.offsets + OFFSET * random.normal(size=hand.offsets.shape)
     own = replace(hand, offsets=offsets).with_skeleton(np.asarray(bones))

@@ -11,15 +11,17 @@ from strategies import grid, joint_angles, motions
 
 jax = pytest.importorskip("jax")
 
+from simulated import quickly  # noqa: E402
+
 from jaxhand import contact, motion  # noqa: E402
 from jaxhand.anthropometry import mean_person, people  # noqa: E402
 from jaxhand.contact import BONES, PAIRS, YIELD, capsules, distance, penetration  # noqa: E402
-from jaxhand.skeleton import (  # noqa: E402
+from numpy_infer.hand import PARENTS, POINTS, load_hand  # noqa: E402
+from numpy_infer.skeleton import (  # noqa: E402
     forward_kinematics,
     marker_positions,
     rotations_from_angles,
 )
-from numpy_infer.hand import PARENTS, POINTS, load_hand  # noqa: E402
 
 GLOVE = load_hand("glove9")
 PERSON = mean_person(GLOVE)
@@ -42,7 +44,7 @@ def drawn():
         rough, settled = motion.angles_of(kind, normal), motion.varied(kind, normal, group)
         return kind, contact.depth(group, rough), contact.depth(group, settled), settled, group
 
-    return jax.tree.map(np.asarray, jax.jit(draw)(jax.random.key(0)))
+    return jax.tree.map(np.asarray, quickly(draw)(jax.random.key(0)))
 
 
 @given(grid((2, 2, 3), 0.1))
@@ -97,7 +99,11 @@ def test_joined_bones_and_the_palm_do_not_meet() -> None:
         ("index_dip", "ring_dip"),
     ):
         assert frozenset(meeting) in pairs
-    assert np.asarray(contact.depth(PERSON, np.zeros(26, np.float32))) == 0
+    assert quickly(contact.depth)(PERSON, np.zeros(26, np.float32)) == 0
+
+
+posed = quickly(lambda *pose: contact.posed(PERSON.skeleton, *pose))
+marked = quickly(lambda *pose: contact.marked(GLOVE, PERSON.skeleton, *pose))
 
 
 @given(joint_angles(), motions())
@@ -105,17 +111,18 @@ def test_posed_is_forward_kinematics(angles, wrist) -> None:
     angles, rotation, position = single(angles), *map(single, wrist)
     local = rotations_from_angles(angles)
     expected = forward_kinematics(PERSON.skeleton, local, rotation, position)
-    found = contact.posed(PERSON.skeleton, angles, rotation, position)
+    found = posed(angles, rotation, position)
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=3e-6)
-    markers, positions = contact.marked(GLOVE, PERSON.skeleton, angles, rotation, position)
+    markers, positions = marked(angles, rotation, position)
     np.testing.assert_allclose(markers, marker_positions(GLOVE, *expected), atol=3e-6)
     np.testing.assert_array_equal(positions, found[0])
 
 
 def test_the_push_is_half_the_gradient_of_the_squared_depths() -> None:
     kind = np.array([NAMES.index("fist")] * 4)
-    angles = motion.angles_of(kind, jax.random.normal(jax.random.key(1), (4, motion.DRAWS))).T
+    normal = jax.random.normal(jax.random.key(1), (4, motion.DRAWS))
+    angles = quickly(motion.angles_of)(kind, normal).T
     radii = single(PERSON.radii)[:, None] * 1.3
     skeleton = single(PERSON.skeleton)[..., None]
 
@@ -128,8 +135,8 @@ def test_the_push_is_half_the_gradient_of_the_squared_depths() -> None:
         force, total, _ = contact.own_repulsion(points, radii, 0)
         return contact.generalised(points, contact.turning(turns, angles)[0], force), total
 
-    down, total = jax.jit(push)(angles)
-    slope = np.asarray(jax.jit(jax.grad(square))(angles)) * contact.EASE[:, None]
+    down, total = quickly(push)(angles)
+    slope = np.asarray(quickly(jax.grad(square))(angles)) * contact.EASE[:, None]
     assert float(total.min()) > 0
     np.testing.assert_allclose(down, -slope / 2, atol=2e-3 * np.abs(slope).max())
 
@@ -144,7 +151,7 @@ def test_settling_frees_flesh_from_flesh() -> None:
 def test_pads_touch_on_everybodys_own_bones() -> None:
     kind, _, _, angles, group = drawn()
     eye, origin = np.eye(3, dtype=np.float32), np.zeros(3, np.float32)
-    positions, _ = contact.posed(group.skeleton, angles, eye, origin)
+    positions, _ = quickly(contact.posed)(group.skeleton, angles, eye, origin)
     segments, radii = capsules(positions, group.radii)
     thumb = BONES.index("thumb_tip")
     for finger in ("index", "middle", "ring", "pinky"):

@@ -11,6 +11,8 @@ import pytest
 
 jax = pytest.importorskip("jax")
 
+from simulated import motion, quickly, worn  # noqa: E402
+
 from jaxhand import dense_truth, simulation  # noqa: E402
 from jaxhand.datasets import load  # noqa: E402
 from jaxhand.dense_truth import PersonTruth  # noqa: E402
@@ -39,10 +41,10 @@ def person() -> tuple[Hand, Array, Array]:
     `[TAKES, FRAMES, 21, 3]`."""
     random = np.random.default_rng(0)
     offsets = DENSE.offsets + OFFSET * random.normal(size=DENSE.offsets.shape)
-    bones = simulation.bone_lengths(jax.random.key(3), DENSE)
+    bones = quickly(simulation.bone_lengths, static_argnums=1)(jax.random.key(3), DENSE)
     own = replace(DENSE, offsets=offsets).with_skeleton(np.asarray(bones))
-    move = simulation.motion(jax.random.key(4), FRAMES, 60.0, (TAKES,))
-    angles, rotation, position = (np.asarray(array, np.float64) for array in move)
+    move = motion(4, FRAMES, 60.0, (TAKES,))
+    angles, rotation, position = (array.astype(np.float64) for array in move)
     turns = rotations_from_angles(angles)
     points, rotations = forward_kinematics(own.skeleton, turns, rotation, position)
     markers = marker_positions(own, points, rotations)
@@ -210,8 +212,8 @@ def test_angles_reach_the_joints_from_a_wrist_that_fingers_tilt(tmp_path: Path) 
 
 
 def test_sig18s_joint_truth_is_fitted_where_it_is_asked_for(tmp_path: Path) -> None:
-    move = simulation.motion(jax.random.key(0), 240, 120.0)
-    markers = simulation.markers(DENSE, np.float32(DENSE.skeleton), *move)
+    move = motion(0, 240, 120.0)
+    markers, true, _ = worn(DENSE, move)
     markers = markers + 1.6e-3 * np.random.default_rng(0).normal(size=markers.shape)
     left = Recording(DENSE.markers, markers, np.arange(240) / 120, 120, "")
     right = replace(left, markers=mirror(left.markers))
@@ -223,15 +225,14 @@ def test_sig18s_joint_truth_is_fitted_where_it_is_asked_for(tmp_path: Path) -> N
     assert load(spec, "test").sequences[0].angles is None
     dataset = load(spec, "test", truth=tmp_path / "truth")
     assert [path.name for path in (tmp_path / "truth").iterdir()] == ["User4.npz"]
-    true = forward_kinematics(DENSE.skeleton, rotations_from_angles(move[0]), *move[1:])[0][::2]
     for sequence in dataset.sequences:
         assert sequence.markers.shape == (120, 9, 3)
         assert np.isfinite(sequence.positions).mean() > 0.95
-        assert np.nanmean(np.linalg.norm(sequence.positions - true, axis=-1)) < 5e-3
+        assert np.nanmean(np.linalg.norm(sequence.positions - true[::2], axis=-1)) < 5e-3
     assert dataset.hand.markers == GLOVE.markers
     wrist, tip = dataset.hand.markers.index("wrist"), dataset.hand.markers.index("thumb_tip")
-    worn = [DENSE.markers.index(name) for name in ("BackHand2", "ThumbTip")]
-    assert [dataset.hand.joints[i] for i in (wrist, tip)] == [DENSE.joints[i] for i in worn]
+    theirs = [DENSE.markers.index(name) for name in ("BackHand2", "ThumbTip")]
+    assert [dataset.hand.joints[i] for i in (wrist, tip)] == [DENSE.joints[i] for i in theirs]
     assert dataset.noise_floor is not None
     again = load(spec, "test", truth=tmp_path / "truth")
     np.testing.assert_array_equal(again.sequences[1].angles, dataset.sequences[1].angles)

@@ -12,6 +12,7 @@ import pytest
 jax = pytest.importorskip("jax")
 
 from hypothesis import given  # noqa: E402
+from simulated import quickly  # noqa: E402
 from strategies import motions, noise, turn  # noqa: E402
 
 from jaxhand import simulation  # noqa: E402
@@ -80,7 +81,7 @@ def recorded(frames: int = 240, seed: int = 0) -> tuple[Hand, Array, Array, Arra
 @functools.cache
 def minute():
     """Compiled once for the whole file."""
-    return jax.jit(lambda key: simulation.streams(key, GLOVE, 1, 3600, RATE))
+    return quickly(lambda key: simulation.streams(key, GLOVE, 1, 3600, RATE))
 
 
 def gloved(angles: Array, drift: float, offset: float, seed: int = 0) -> Array:

@@ -7,16 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-jax = pytest.importorskip("jax")
+pytest.importorskip("jax")
 pytest.importorskip("tyro")
 
-from fitted import fitted_model  # noqa: E402
+from fitted import fitted_model
+from simulated import motion, worn
 
-from jaxhand import cli, simulation  # noqa: E402
-from numpy_infer import load_hand, model, wearer  # noqa: E402
-from numpy_infer.geometry import mirror  # noqa: E402
-from numpy_infer.hand import POINTS  # noqa: E402
-from numpy_infer.recordings import Recording, write  # noqa: E402
+from jaxhand import cli
+from numpy_infer import load_hand, model, wearer
+from numpy_infer.geometry import mirror
+from numpy_infer.hand import POINTS
+from numpy_infer.recordings import Recording, write
 
 GLOVE = load_hand("glove9")
 RATE, SECONDS, LARGER = 60.0, 6, 1.12
@@ -28,14 +29,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("glove")
     model.save(fitted_model(), folder / "model.npz")
     frames = round(RATE * SECONDS)
-    skeleton = np.float32(LARGER * GLOVE.skeleton)
-    move = simulation.motion(jax.random.key(3), frames, RATE)
-    ease = np.clip(np.arange(frames) / RATE - 1, 0, 1)[:, None]
-    markers = simulation.markers(
-        GLOVE, skeleton, move.angles * ease, move.wrist_rotation, move.wrist_position
-    )
+    move = motion(3, frames, RATE)
+    ease = np.clip(np.arange(frames) / RATE - 1, 0, 1)[:, None].astype(np.float32)
+    move = move._replace(angles=move.angles * ease)
+    markers = worn(GLOVE.with_skeleton(LARGER * GLOVE.skeleton), move)[0]
     noise = 0.3e-3 * np.random.default_rng(0).standard_normal(markers.shape)
-    markers = np.asarray(markers, np.float64) + noise
+    markers = markers + noise
     time = np.arange(frames) / RATE
     write(Recording(GLOVE.markers, markers, time, RATE, source=""), folder / "left.csv")
     write(Recording(GLOVE.markers, mirror(markers), time, RATE, source=""), folder / "right.csv")

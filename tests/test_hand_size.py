@@ -7,17 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-jax = pytest.importorskip("jax")
+pytest.importorskip("jax")
 
-from fitted import fitted_model  # noqa: E402
-from strategies import turn  # noqa: E402
+from fitted import fitted_model
+from simulated import motion, worn
+from strategies import turn
 
-from jaxhand import simulation  # noqa: E402
-from jaxhand.hand_size import ALIKE, FEWEST, Size, hand_size  # noqa: E402
-from numpy_infer import load_hand  # noqa: E402
-from numpy_infer.arrays import Array  # noqa: E402
-from numpy_infer.hand import FINGERS  # noqa: E402
-from numpy_infer.model import Model  # noqa: E402
+from jaxhand.hand_size import ALIKE, FEWEST, Size, hand_size
+from numpy_infer import load_hand
+from numpy_infer.arrays import Array
+from numpy_infer.hand import FINGERS
+from numpy_infer.model import Model
 
 GLOVE = load_hand("glove9")
 FRAMES, RATE = 600, 30.0
@@ -30,11 +30,8 @@ def model() -> Model:
 
 def recording(factor: float, seed: int = 1) -> Array:
     """`[T, M, 3]` metres: free motion of a hand of this size, measured with 0.3 mm of noise."""
-    move = simulation.motion(jax.random.key(seed), FRAMES, RATE)
-    hand = GLOVE.resized(factor)
-    markers = simulation.markers(hand, np.float32(hand.skeleton), *move)
-    noise = 0.3e-3 * np.random.default_rng(seed).standard_normal(markers.shape)
-    return np.asarray(markers, np.float64) + noise
+    markers = worn(GLOVE.resized(factor), motion(seed, FRAMES, RATE))[0]
+    return markers + 0.3e-3 * np.random.default_rng(seed).standard_normal(markers.shape)
 
 
 @pytest.mark.parametrize("factor", [0.86, 0.95, 1.12])

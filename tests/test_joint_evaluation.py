@@ -8,18 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-jax = pytest.importorskip("jax")
+pytest.importorskip("jax")
 
-from streams import a_model  # noqa: E402
+from simulated import motion, worn
+from streams import a_model
 
-from jaxhand import joint_evaluation as evaluation  # noqa: E402
-from jaxhand import report, simulation  # noqa: E402
-from jaxhand.joint_evaluation import Row  # noqa: E402
-from jaxhand.sequences import Dataset, Sequence  # noqa: E402
-from jaxhand.skeleton import forward_kinematics, rotations_from_angles  # noqa: E402
-from jaxhand.sparse_fit import prior_of  # noqa: E402
-from numpy_infer import load_hand  # noqa: E402
-from numpy_infer.arrays import Array  # noqa: E402
+from jaxhand import joint_evaluation as evaluation
+from jaxhand import report
+from jaxhand.joint_evaluation import Row
+from jaxhand.sequences import Dataset, Sequence
+from jaxhand.sparse_fit import prior_of
+from numpy_infer import load_hand
+from numpy_infer.arrays import Array
 
 GLOVE = load_hand("glove9")
 FRAMES, LARGER = 70, 1.1
@@ -29,15 +29,8 @@ FRAMES, LARGER = 70, 1.1
 def dataset() -> Dataset:
     """Two hands of a person 10 % larger than the bundled one."""
     hand = GLOVE.with_skeleton(LARGER * GLOVE.skeleton)
-    move = simulation.motion(jax.random.key(0), FRAMES, 60.0, (2,))
-    skeleton = np.float32(hand.skeleton)
-    positions, rotations = forward_kinematics(
-        skeleton, rotations_from_angles(move.angles), move.wrist_rotation, move.wrist_position
-    )
-    markers = simulation.markers(
-        hand, skeleton, move.angles, move.wrist_rotation, move.wrist_position
-    )
-    arrays = zip(*map(np.asarray, (markers, positions, rotations, move.angles)), strict=True)
+    move = motion(0, FRAMES, 60.0, (2,))
+    arrays = zip(*worn(hand, move), move.angles, strict=True)
     sequences = tuple(Sequence(f"take/{i}", "take", 60.0, *parts) for i, parts in enumerate(arrays))
     return Dataset("simulated", hand, sequences)
 

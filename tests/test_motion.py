@@ -9,6 +9,8 @@ import pytest
 
 jax = pytest.importorskip("jax")
 
+from simulated import quickly  # noqa: E402
+
 from jaxhand import contact, motion  # noqa: E402
 from jaxhand.anthropometry import mean_person, people  # noqa: E402
 from jaxhand.motion import KEYFRAMES, Motion  # noqa: E402
@@ -33,7 +35,7 @@ def compiled():
         eye, origin = jax.numpy.eye(3), jax.numpy.zeros(3)
         return move, contact.posed(PERSON.skeleton, move.angles, eye, origin)[0]
 
-    return jax.jit(draw)
+    return quickly(draw)
 
 
 @functools.cache
@@ -57,11 +59,10 @@ def test_the_same_key_gives_the_same_motion_and_another_key_another() -> None:
 
 def test_shapes() -> None:
     def shape(batch):
-        group = people(jax.random.key(0), GLOVE, batch)
-        call = jax.eval_shape(
-            lambda key: motion.motion(key, 7, RATE, batch, group), jax.random.key(0)
-        )
-        return [a.shape for a in call]
+        def draw(key):
+            return motion.motion(key, 7, RATE, batch, people(key, GLOVE, batch))
+
+        return [a.shape for a in jax.eval_shape(draw, jax.random.key(0))]
 
     for batch in ((), (2, 3)):
         assert shape(batch) == [(*batch, 7, 26), (*batch, 7, 3, 3), (*batch, 7, 3)]
@@ -77,10 +78,10 @@ def test_every_keyframe_can_be_taken() -> None:
     """Settled, it is clear of itself, and near to what it says."""
     kind = np.arange(len(KEYFRAMES))
     still = np.zeros((len(kind), motion.DRAWS), np.float32)
-    angles = np.asarray(jax.jit(motion.varied)(kind, still))
-    depth = np.asarray(jax.jit(contact.depth)(PERSON, angles))
+    angles = np.asarray(quickly(motion.varied)(kind, still))
+    depth = np.asarray(quickly(contact.depth)(PERSON, angles))
     assert {KEYFRAMES[i].name for i in np.flatnonzero(depth > contact.YIELD + 2e-3)} == set()
-    off = np.abs(angles - np.asarray(motion.angles_of(kind, still)))
+    off = np.abs(angles - np.asarray(quickly(motion.angles_of)(kind, still)))
     fingers = [i for i, name in enumerate(NAMES) if "thumb" not in name]
     assert np.degrees(off[:, fingers]).max() < 20
 
@@ -101,7 +102,7 @@ def test_dip_follows_pip_and_flexed_fingers_are_not_spread() -> None:
 
 
 def test_hands_pass_through_themselves_little() -> None:
-    depth = np.asarray(jax.jit(contact.depth)(PERSON, moved()[0].angles))
+    depth = np.asarray(quickly(contact.depth)(PERSON, moved()[0].angles))
     assert np.quantile(depth, 0.9) < contact.YIELD + 1e-3
     assert np.quantile(depth, 0.99) < 0.012
 
@@ -129,7 +130,7 @@ def test_the_wrist_stays_in_the_room() -> None:
 def test_tremor_is_a_tenth_of_a_millimetre_about_ten_hertz() -> None:
     draws = motion.uniform(jax.random.key(0), (200, 44))
     time = np.arange(600, dtype=np.float32) / RATE
-    angles, drift, _ = motion.shaking(draws, time)
+    angles, drift, _ = quickly(motion.shaking)(draws, time)
     index = np.asarray(angles)[..., NAMES.index("index_mcp_flexion")]
     power = np.abs(np.fft.rfft(index - index.mean(-1, keepdims=True), axis=-1)) ** 2
     hertz = np.fft.rfftfreq(600, 1 / RATE)
@@ -146,7 +147,7 @@ def test_a_schedule_has_stops_enough(seconds: int) -> None:
     count = motion.enough(seconds, motion.MOVE_SECONDS)
     draws = motion.uniform(jax.random.key(0), (500, 7 * (count - 1)))
     time = np.arange(seconds * 60, dtype=np.float32) / 60
-    plan = motion.schedule(draws, time, motion.MOVE_SECONDS)
+    plan = quickly(lambda draws: motion.schedule(draws, time, motion.MOVE_SECONDS))(draws)
     assert (np.diff(np.asarray(plan.move)) >= 0).all()
     assert (np.asarray(plan.move)[:, -1] == count - 2).mean() < 0.02
     assert (np.asarray(plan.share) >= 0).all()

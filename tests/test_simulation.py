@@ -9,6 +9,8 @@ import pytest
 
 jax = pytest.importorskip("jax")
 
+from simulated import quickly  # noqa: E402
+
 from jaxhand import simulation  # noqa: E402
 from jaxhand.motion import HOME  # noqa: E402
 from jaxhand.simulation import Streams  # noqa: E402
@@ -27,7 +29,7 @@ def compiled(name: str):
         "streams": lambda key: simulation.streams(key, GLOVE, COUNT, LENGTH, RATE),
         "frames": lambda key: simulation.frames(key, GLOVE, 20000),
     }
-    return jax.jit(calls[name])
+    return quickly(calls[name])
 
 
 @functools.cache
@@ -83,7 +85,8 @@ def test_bones_keep_their_length() -> None:
 
 
 def test_people_differ_in_size_and_a_little_in_proportion() -> None:
-    skeletons = np.asarray(simulation.bone_lengths(jax.random.key(0), GLOVE, (4000,)))
+    draw = quickly(lambda key: simulation.bone_lengths(key, GLOVE, (4000,)))
+    skeletons = np.asarray(draw(jax.random.key(0)))
     scale = np.log(np.linalg.norm(skeletons[:, 1:], axis=-1) / np.array([*_lengths()]))
     assert scale.mean(1).std() == pytest.approx(simulation.PERSON_SPREAD, rel=0.1)
     single = (scale - scale.mean(1, keepdims=True)).std()
@@ -181,8 +184,8 @@ def test_several_markers_are_hidden_at_once_now_and_then() -> None:
 
 def test_vmap_draws_one_hand_for_each_key() -> None:
     keys = jax.random.split(jax.random.key(3), 3)
-    many = jax.jit(jax.vmap(simulation.poses))(keys)
-    np.testing.assert_allclose(many[1], simulation.poses(keys[1]), atol=1e-5)
+    many = quickly(jax.vmap(simulation.poses))(keys)
+    np.testing.assert_allclose(many[1], quickly(simulation.poses)(keys[1]), atol=1e-5)
 
     # Traced only: compiling them takes longer than they are worth.
     def shape(function) -> list[tuple[int, ...]]:

@@ -9,6 +9,8 @@ import pytest
 
 jax = pytest.importorskip("jax")
 
+from simulated import quickly  # noqa: E402
+
 from jaxhand import contact, motion, two_hands  # noqa: E402
 from jaxhand.anthropometry import People, mean_person, people, placed  # noqa: E402
 from jaxhand.geometry import mirror  # noqa: E402
@@ -18,6 +20,7 @@ from numpy_infer.hand import ANGLES, load_hand  # noqa: E402
 
 RATE, COUNT, LENGTH = 60.0, 16, 900
 GLOVE = load_hand("glove9")
+PERSON = mean_person(GLOVE)
 
 
 @functools.cache
@@ -30,7 +33,7 @@ def compiled():
         depth = two_hands.penetration(seen[0][1], seen[1][1], group)
         return group, left, right, seen, depth
 
-    return jax.jit(draw)
+    return quickly(draw)
 
 
 @functools.cache
@@ -40,20 +43,19 @@ def drawn():
 
 @functools.cache
 def stops() -> tuple[np.ndarray, np.ndarray]:
-    person = mean_person(GLOVE)
-    draw = jax.jit(lambda d: two_hands.scenes(d, person))
+    draw = quickly(lambda d: two_hands.scenes(d, PERSON))
     draws = motion.uniform(jax.random.key(1), (200, two_hands.SCENE_DRAWS))
     return jax.tree.map(np.asarray, draw(draws))
 
 
-def depth_of(rows: np.ndarray) -> np.ndarray:
+@quickly
+def depth_of(rows):
     """Between the hands of `[..., 2, 32]`, on the mean person."""
-    person = mean_person(GLOVE)
     turns = motion.from_pitch_yaw_roll(rows[..., 29:])
-    points, _ = contact.posed(person.skeleton, rows[..., :26], turns, rows[..., 26:29])
+    points, _ = contact.posed(PERSON.skeleton, rows[..., :26], turns, rows[..., 26:29])
     left, right = points[..., 0, :, :], mirror(points[..., 1, :, :])
-    whole = np.broadcast_to(person.radii, (len(rows), 21))
-    return np.asarray(two_hands.penetration(left[:, None], right[:, None], People(whole, whole)))
+    whole = np.broadcast_to(PERSON.radii, (len(rows), 21))
+    return two_hands.penetration(left[:, None], right[:, None], People(whole, whole))
 
 
 def test_the_same_key_gives_the_same_hands() -> None:
@@ -80,12 +82,12 @@ def test_a_right_hand_is_the_mirror_image_of_a_left_one() -> None:
     )
     for make in (two_hands.marked, two_hands.posed):
         hand = (GLOVE,) if make is two_hands.marked else ()
-        a = jax.jit(lambda move, make=make, hand=hand: make(*hand, group.skeleton, move))(left)
-        b = jax.jit(lambda move, make=make, hand=hand: make(*hand, group.skeleton, move, True))(
+        a = quickly(lambda move, make=make, hand=hand: make(*hand, group.skeleton, move))(left)
+        b = quickly(lambda move, make=make, hand=hand: make(*hand, group.skeleton, move, True))(
             image
         )
         np.testing.assert_array_equal(np.asarray(a[0]) * flip, b[0])
-    turned = np.asarray(two_hands.posed(group.skeleton, image, True)[1])
+    turned = np.asarray(b[1])  # by `posed`
     np.testing.assert_allclose(turned[:, :, 0], image.wrist_rotation, atol=1e-6)
 
 
@@ -93,17 +95,23 @@ def test_markers_sit_where_they_are_placed() -> None:
     from dataclasses import replace
 
     group, left, _, _, _ = drawn()
-    worn = replace(GLOVE, offsets=placed(jax.random.key(4), GLOVE, group))
-    markers, positions = map(np.asarray, two_hands.marked(worn, group.skeleton, left))
+
+    @quickly
+    def wear(key):
+        offsets = placed(key, GLOVE, group)
+        own = replace(GLOVE, offsets=offsets)
+        return offsets, *two_hands.marked(own, group.skeleton, left)
+
+    offsets, markers, positions = map(np.asarray, wear(jax.random.key(4)))
     wrist = GLOVE.markers.index("wrist")
     off = np.einsum("ntij,nti->ntj", left.wrist_rotation, markers[:, :, wrist] - positions[:, :, 0])
-    expected = np.broadcast_to(np.asarray(worn.offsets)[:, None, wrist], off.shape)
+    expected = np.broadcast_to(offsets[:, None, wrist], off.shape)
     np.testing.assert_allclose(off, expected, atol=1e-5)
 
 
 def test_hands_that_meet_touch_and_do_not_pass_through_each_other() -> None:
     rows, scene = stops()
-    depth = depth_of(rows[:, 2])[:, 0]
+    depth = np.asarray(depth_of(rows[:, 2]))[:, 0]
     for number, of in enumerate(SCENES):
         own = depth[scene == number]
         assert len(own) > 3
