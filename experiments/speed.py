@@ -9,9 +9,8 @@ from __future__ import annotations
 import argparse
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 # Before numpy and JAX are loaded: one thread, as an app that tracks beside its own work has it.
@@ -22,14 +21,20 @@ import jax
 import numpy as np
 
 from jaxhand import simulation, tasks, training
+from jaxhand import tracker as jax_tracker
+from jaxhand.anthropometry import people
+from jaxhand.cameras import Rig, film
 from jaxhand.joints import joint_stage
+from jaxhand.networks import predict
 from jaxhand.sparse_fit import least_squares, prior_of
 from jaxhand.tasks import Frames
 from jaxhand.training import TrainingConfig, fit_networks
+from jaxhand.two_hands import marked, two_hands
+from numpy_infer import tracker
 from numpy_infer.arrays import Array
 from numpy_infer.hand import load_hand
 from numpy_infer.model import Model
-from numpy_infer.networks import predict
+from numpy_infer.networks import Dense, Network
 from numpy_infer.tracker import HandTracker
 
 FRAMES = 20_000
@@ -81,35 +86,115 @@ def print_training(rounds: int) -> Model:
 
 
 def print_tracking(model: Model, rounds: int) -> None:
-    """One hand, one marker hidden, the whole pipeline with joints, beside the plain forward pass of
-    the two networks."""
+    """The whole pipeline, finger alignment and pose included, in units of its two networks."""
     hand = model.hand
-    streams = simulation.streams(jax.random.key(2), hand, 1, rounds + 1)
-    markers = np.array(streams.markers[0], np.float64)
-    markers[1:, 4] = np.nan
-    trackers = (HandTracker(replace(model, alignment=on)) for on in (False, True))
-    plain, aligned = ((tracker, iter(markers)) for tracker in trackers)
-    inputs, every = np.zeros(3 * len(hand), np.float32), np.ones(3 * len(hand), bool)
+    streams = simulation.streams(jax.random.key(2), hand, 4, rounds + 1)
+    markers = np.array(np.swapaxes(streams.markers, 0, 1), np.float64)
+    features = np.zeros(3 * len(hand), np.float32)
 
-    def networks() -> None:
+    def unit() -> None:
         for network in (model.marker_network, model.joint_network):
             assert network is not None
-            predict(network, inputs, every)
+            plain(network, features)
 
-    def step(tracker: HandTracker, frames: Iterator[Array]) -> None:
-        tracker.step(next(frames), 1 / 60)
+    def track(hands: int | None, hidden: Callable[[int], list[int]], **changes: Any) -> Any:
+        tracker = HandTracker(replace(model, **changes), right=[False] * hands if hands else False)
+        frames = markers[:, :hands].copy() if hands else markers[:, 0].copy()
+        for i, frame in enumerate(frames):
+            frame[..., hidden(i), :] = np.nan
+        ahead = iter(frames)
+        return lambda: tracker.step(next(ahead), 1 / 60)
 
-    runs = {"step": partial(step, *plain), "aligned": partial(step, *aligned), "networks": networks}
+    aligned = {"alignment": True}
+    runs = {
+        "its two networks alone: the unit": unit,
+        "one hand, one marker hidden": track(None, lambda i: [4][: i > 0], **aligned),
+        "  without finger alignment": track(None, lambda i: [4][: i > 0]),
+        "  nothing hidden": track(None, lambda i: [], **aligned),
+        "  another marker hidden each frame": track(None, lambda i: [4 + i % 4], **aligned),
+        "two hands": track(2, lambda i: [4][: i > 0], **aligned),
+        "four hands": track(4, lambda i: [4][: i > 0], **aligned),
+    }
     taken = interleaved(runs, rounds)
-    print("\nnumpy, one hand, one marker hidden, µs a frame")
-    for name, text in (
-        ("step", "HandTracker.step"),
-        ("aligned", "with finger alignment"),
-        ("networks", "its two networks alone"),
-    ):
-        seconds = 1e6 * taken[name]
-        print(f"  {text:28} {spread(seconds, 0)}, 99 % {np.quantile(seconds, 0.99):.0f}")
-    print(f"  {'ratio':28} {spread(taken['step'] / taken['networks'])}")
+    print("\nnumpy, HandTracker.step, µs a frame; in units; 99 % over median")
+    first = taken["its two networks alone: the unit"]
+    for name, seconds in taken.items():
+        tail = np.quantile(seconds, 0.99) / np.median(seconds)
+        print(
+            f"  {name:36} {spread(1e6 * seconds, 0):18} {spread(seconds / first, 1):18} {tail:.2f}"
+        )
+
+
+def plain(network: Network, inputs: Array) -> Array:
+    """The forward pass as anyone would write it."""
+    x = (inputs - network.input_mean) / network.input_scale
+    for i, layer in enumerate(network.spec):
+        if isinstance(layer, Dense):
+            x = x @ network.arrays[f"{i}.kernel"] + network.arrays[f"{i}.bias"]
+            if layer.activation == "relu":
+                x = np.maximum(x, 0)
+    return x * network.output_scale + network.output_mean
+
+
+def print_offline(model: Model, rounds: int, frames: int = 2048, hands: int = 64) -> None:
+    """Whole recordings at once: numpy, of one hand; JAX, of many, beside the networks alone."""
+    model = replace(model, alignment=True)
+    streams = simulation.streams(jax.random.key(4), model.hand, hands, frames)
+    whole = (np.swapaxes(streams.markers, 0, 1), np.swapaxes(streams.visible, 0, 1))
+    markers, visible = (np.asarray(array) for array in whole)
+    dt = np.full((frames, hands), 1 / 60, np.float32)
+    some = slice(frames // 8)
+
+    def networks(inputs: Array) -> Any:
+        return [predict(network, inputs) for network in (model.marker_network, model.joint_network)]
+
+    one = np.array(markers[:, 0], np.float64), visible[:, 0], np.full(frames, 1 / 60)
+    full = one[0], np.ones_like(one[1]), one[2]
+    features = markers[some].reshape(-1, hands, 3 * len(model.hand))
+    run = jax.jit(lambda state, *arrays: jax_tracker.run(model, state, *arrays)[1])
+    start, both = jax_tracker.init(model, (hands,)), jax.jit(networks)
+    runs: dict[str, Callable[[], Any]] = {
+        "numpy, gaps": lambda: tracker.run(model, tracker.init(model), *one),
+        "numpy, no gaps": lambda: tracker.run(model, tracker.init(model), *full),
+        "JAX": lambda: jax.block_until_ready(run(start, markers[some], visible[some], dt[some])),
+        "JAX, two networks": lambda: jax.block_until_ready(both(features)),
+    }
+    taken = interleaved(runs, rounds)
+    done = {name: frames if name.startswith("numpy") else frames // 8 * hands for name in runs}
+    print("\nwhole recordings, with finger alignment, 1,000 frames a second")
+    for name, seconds in taken.items():
+        print(f"  {name:28} {spread(done[name] / seconds / 1e3, 1)}")
+    print(f"  {'ratio':28} {spread(taken['JAX, two networks'] / taken['JAX'])}")
+    changes = (one[1][1:] != one[1][:-1]).any(-1).mean()
+    print(f"  (the visible set changes in {100 * changes:.0f} % of these frames)")
+
+
+def print_simulator(rounds: int, frames: int = 600, scenes: int = 16) -> None:
+    """Two simulated hands, without gaps and before eight cameras."""
+    hand = load_hand("glove9")
+    person = people(jax.random.key(5), hand, (scenes,))
+
+    @jax.jit
+    def bare(key: Array) -> Any:
+        moves = two_hands(key, frames, 60.0, (scenes,), person)
+        return [
+            marked(hand, person.skeleton, move, right)
+            for move, right in zip(moves, (False, True), strict=True)
+        ]
+
+    @jax.jit
+    def filmed(key: Array) -> Any:
+        moves = two_hands(key, frames, 60.0, (scenes,), person)
+        return film(key, hand, person, *moves, 60.0, Rig(cameras=8))
+
+    runs = {
+        name: lambda made=made: jax.block_until_ready(made(jax.random.key(6)))
+        for name, made in (("no gaps", bare), ("eight cameras", filmed))
+    }
+    taken = interleaved(runs, rounds)
+    print("\nJAX, two simulated hands, 1,000 frames a second")
+    for name, seconds in taken.items():
+        print(f"  {name:28} {spread(frames * scenes / seconds / 1e3, 1)}")
 
 
 def print_joints(model: Model, rounds: int, frames: int = 1000) -> None:
@@ -138,7 +223,9 @@ def main() -> None:
     options = parser.parse_args()
     model = print_training(options.rounds)
     print_tracking(model, options.frames)
+    print_offline(model, options.rounds)
     print_joints(model, options.rounds)
+    print_simulator(min(options.rounds, 5))
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from numpy_infer import geometry
 from numpy_infer import skeleton as runtime
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, CHAINS, FINGERS, Hand
-from numpy_infer.tracker import DETERMINED_EXTENT
+from numpy_infer.pose import DETERMINED_EXTENT
 
 __all__ = ["Calibration", "Priors", "Unknowns", "calibrate", "new_hand"]
 

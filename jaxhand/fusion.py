@@ -27,8 +27,8 @@ from numpy_infer.arrays import Array
 from numpy_infer.geometry import kabsch as numpy_kabsch
 from numpy_infer.geometry import mirror, mirror_rotation, nearest_rotation, shortest_arc
 from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, PARENTS, Hand, flat_points
+from numpy_infer.pose import DETERMINED_EXTENT
 from numpy_infer.recordings import Recording
-from numpy_infer.tracker import DETERMINED_EXTENT
 
 MARKER_NOISE = 2e-3
 """Metres per axis: the standard deviation of a marker from where hand and angles have it."""
@@ -344,9 +344,9 @@ def _paper_fuse(hand: Hand, imu: Array, markers: Array, seen: Array, _: Array) -
     measured = untransform(rotation, position, markers)
     aimed = seen & determined[:, None]
     _, points, links = in_hand_frame(hand, imu)
-    aligned = align_fingers(hand, imu, points, links, measured, aimed.astype(imu.dtype))
+    _, aligned = align_fingers(hand, points, links, measured, aimed.astype(imu.dtype))
     # Apart from what the glove felt then, the turn can be held.
-    turn = product(aligned[:, ::3], jnp.swapaxes(imu[:, ::3], -1, -2))
+    turn = product(aligned[:, 1::3], jnp.swapaxes(imu[:, ::3], -1, -2))
     turn = jax.vmap(_held, 1, 1)(turn, _by_finger(hand, aimed[..., None])[:, :, -1, 0])
     fused = imu.at[:, ::3].set(product(turn, imu[:, ::3]))
     return _result(hand, fused, rotation, position, markers, seen)

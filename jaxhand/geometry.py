@@ -142,9 +142,11 @@ def kabsch(
 
 def prior_weight(covariance: Array) -> Array:
     """`[...]` how much of the prior to add to a `[..., 3, 3]` cross-covariance, in m²."""
-    cofactors = cross(covariance[..., _NEXT, :], covariance[..., _AFTER, :])
     size = jnp.sqrt((covariance * covariance).sum((-1, -2)))
-    second = jnp.sqrt((cofactors * cofactors).sum((-1, -2))) / jnp.where(size > 0, size, 1)
+    # In parts of its size: its cofactors, squared, would overflow in float32.
+    unit = covariance / jnp.where(size > 0, size, 1)[..., None, None]
+    cofactors = cross(unit[..., _NEXT, :], unit[..., _AFTER, :])
+    second = jnp.sqrt((cofactors * cofactors).sum((-1, -2))) * size
     return PRIOR_STRENGTH * jnp.maximum(0, 1 - second / PRIOR_STRENGTH) ** 2
 
 
@@ -218,7 +220,7 @@ def rotation_from_vector(vector: Array) -> Array:
     return turned + jnp.eye(3, dtype=vector.dtype)
 
 
-def shortest_arc(source: Array, target: Array, share: Array) -> Array:
+def shortest_arc(source: Array, target: Array, share: Array | None = None) -> Array:
     """`[..., 3, 3]` the least rotation that turns the direction of `source` into that of `target`,
     or the `share [...]` of it in 0 to 1.
 
@@ -233,7 +235,7 @@ def shortest_arc(source: Array, target: Array, share: Array) -> Array:
     opposite = (sine <= 1e-6 * jnp.abs(cosine)) & (cosine < 0)
     axis = jnp.where(opposite[..., None], aside, crossed)
     length = jnp.sqrt((axis * axis).sum(-1))
-    angle = share * jnp.arctan2(sine, cosine)
+    angle = jnp.arctan2(sine, cosine) * (1 if share is None else share)
     return rotation_from_vector(axis * (angle / jnp.where(length > 0, length, 1))[..., None])
 
 

@@ -10,11 +10,11 @@ import jax.numpy as jnp
 from jaxhand.geometry import kabsch, untransform
 from jaxhand.networks import predict
 from jaxhand.skeleton import (
-    align_fingers,
     angles_from_rotations,
     bend_fingers,
     flat_calibrated,
-    forward_kinematics,
+    in_world,
+    place_fingers,
     rotations_from_angles,
 )
 from numpy_infer.arrays import Array
@@ -43,20 +43,16 @@ def joint_stage(model: Model, markers: Array, rotation: Array, position: Array) 
     own = untransform(rotation, position, markers)
     features = own if model.wearer is None else _as_trained(model, own)
     features = features.reshape(*features.shape[:-2], -1)
-    angles = predict(network, features, jnp.ones(features.shape, bool))
-    local = rotations_from_angles(angles)
+    angles = predict(network, features)
     if model.flat is not None:
-        local = flat_calibrated(local, jnp.asarray(model.flat, local.dtype))
-    skeleton = jnp.asarray(model.body.skeleton, markers.dtype)
+        flat = jnp.asarray(model.flat, angles.dtype)
+        angles = angles_from_rotations(flat_calibrated(rotations_from_angles(angles), flat))
+    # In the hand frame: far from the origin float32 is too coarse for what is aligned.
     if model.alignment:
-        # In the hand frame: far from the origin float32 is too coarse for it.
-        still = jnp.eye(3, dtype=markers.dtype), jnp.zeros(3, markers.dtype)
-        for align in (bend_fingers, align_fingers):
-            placed = forward_kinematics(skeleton, local, *still)
-            local = align(model.body, local, *placed, own, jnp.ones_like(own[..., 0]))
-    positions, rotations = forward_kinematics(skeleton, local, rotation, position)
-    if model.flat is not None or model.alignment:
-        angles = angles_from_rotations(local)
+        angles = bend_fingers(model.body, angles, own)
+    towards = own if model.alignment else None
+    angles, positions, rotations = place_fingers(model.body, angles, towards)
+    positions, rotations = in_world(positions, rotations, rotation, position)
     return {
         "angles": angles,
         "rotations": rotations,

@@ -23,7 +23,7 @@ for _kind, _data, _meta in (
     (
         Model,
         ("hand", "wearer", "flat", "marker_network", "joint_network", "fade", "expected_error"),
-        ("predictor", "joints", "alignment", "continuity"),
+        ("predictor", "joints", "alignment", "gate", "continuity"),
     ),
 ):
     jax.tree_util.register_dataclass(_kind, _data, _meta, drop_fields=["training"])
@@ -93,18 +93,20 @@ def apply(spec: Spec, arrays: Mapping[str, Array], inputs: Array) -> Array:
     return from_arrays(spec, arrays)(inputs)
 
 
-def predict(network: Network, inputs: Array, known: Array) -> Array:
+def predict(network: Network, inputs: Array, known: Array | None = None) -> Array:
     """Runs a network in the units of its data.
 
     Args:
         inputs: `[..., in]`, finite where known.
         known: `[..., in]` True where the input may be read; elsewhere it enters as 0 after scaling
-            (paper, section 3.2.2), that is, as its mean.
+            (paper, section 3.2.2), that is, as its mean. None: everywhere.
 
     Returns:
         `[..., out]` in the dtype of `inputs`; the layers themselves run in that of the weights.
     """
     dtype = network.input_mean.dtype
     scaled = (inputs.astype(dtype) - network.input_mean) / network.input_scale
-    outputs = apply(network.spec, network.arrays, jnp.where(known, scaled, 0))
+    if known is not None:
+        scaled = jnp.where(known, scaled, 0)
+    outputs = apply(network.spec, network.arrays, scaled)
     return (network.output_mean + network.output_scale * outputs).astype(inputs.dtype)

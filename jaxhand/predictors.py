@@ -25,6 +25,7 @@ from numpy_infer.networks import Network
 from numpy_infer.predictors import (
     AVERAGE_SECONDS,
     RIDGE,
+    SHORTEST,
     AffineState,
     LastKnownState,
     MovingAverageState,
@@ -84,7 +85,7 @@ def moving_average_step(
     last third of a second. Counted in seconds, from pairs of measured frames alone; a pair with no
     time between its frames says nothing of a velocity."""
     elapsed = dt[..., None]
-    paired = visible & state.visible & (elapsed > 0)
+    paired = visible & state.visible & (elapsed > SHORTEST)
     fade = jnp.exp(-elapsed / AVERAGE_SECONDS).astype(markers.dtype)
     travelled = jnp.where(paired[..., None], markers - state.position, 0)
     path = jnp.where(visible[..., None], state.path * fade[..., None] + travelled, state.path)
@@ -175,25 +176,24 @@ def learned_step(
     visible: Array,
     last: Array,
     dt: Array,
-    registration: tuple[Array, Array] | None = None,
 ) -> tuple[tuple[()], Array]:
     """Marker regressor (paper, section 3.2.2): the visible markers, registered to the template, go
-    through the network, hidden ones entering as 0; what it says of hidden ones is moved back.
-
-    `registration`: rotation and translation `world_from_template` of the visible markers, where
-    the caller has them already.
-    """
-    network: Network = model.marker_network  # type: ignore[assignment]
+    through the network, hidden ones entering as 0; what it says of hidden ones is moved back."""
     template = jnp.asarray(model.hand.template, markers.dtype)
     measured = jnp.where(visible[..., None], markers, 0)
-    if registration is None:
-        eye = jnp.broadcast_to(jnp.eye(3, dtype=markers.dtype), (*visible.shape[:-1], 3, 3))
-        registration = kabsch(template, measured, visible.astype(markers.dtype), eye)
-    flat = (*visible.shape[:-1], 3 * visible.shape[-1])
-    registered = untransform(*registration, measured).reshape(flat)
-    known = jnp.broadcast_to(visible[..., None], markers.shape).reshape(flat)
-    outputs = predict(network, registered, known).reshape(markers.shape)
-    return state, jnp.where(visible[..., None], markers, transform(*registration, outputs))
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=markers.dtype), (*visible.shape[:-1], 3, 3))
+    registration = kabsch(template, measured, visible.astype(markers.dtype), eye)
+    predicted = predicted_markers(model, untransform(*registration, measured), visible)
+    return state, jnp.where(visible[..., None], markers, transform(*registration, predicted))
+
+
+def predicted_markers(model: Model, registered: Array, visible: Array) -> Array:
+    """`[..., M, 3]` metres, registered frame: what the marker network says of all markers, given
+    those `visible [..., M]` of `registered [..., M, 3]`."""
+    network: Network = model.marker_network  # type: ignore[assignment]
+    features = registered.reshape(*registered.shape[:-2], -1)
+    known = jnp.repeat(visible, 3, -1)
+    return predict(network, features, known).reshape(registered.shape)
 
 
 def none_init(model: Model, batch: tuple[int, ...] = ()) -> tuple[()]:

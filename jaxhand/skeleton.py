@@ -5,20 +5,18 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhand.geometry import apart, cross, product, shortest_arc
+from jaxhand.geometry import apart, cross, product, shortest_arc, transform
 from numpy_infer.arrays import Array
-from numpy_infer.hand import JOINTS, Hand
+from numpy_infer.hand import CHAINS, JOINTS, Hand
 from numpy_infer.skeleton import (
+    BASE_ANGLES,
     BEND_NOISE,
     BEND_PRIOR,
     CROSS,
     CROSS_SQUARED,
     EULER,
     FARTHEST_BEND,
-    HINGE_AXES,
-    HINGE_CROSS,
-    HINGE_SQUARED,
-    HINGES,
+    FLEXIONS,
     JOINT_AXES,
     SIGNS,
     SLOTS,
@@ -45,30 +43,40 @@ def angles_from_rotations(rotations: Array) -> Array:
     A rotation that a joint's angles cannot express loses the part they lack. The middle angle of
     the three, abduction, lies in ±π/2: there flexion and twist are one motion and not told apart.
     """
-    axes = jnp.asarray(JOINT_AXES).astype(rotations.dtype)
+    signs = jnp.asarray(SIGNS).astype(rotations.dtype)
+    return _euler(rotations, JOINT_AXES)[..., *EULER] * signs
+
+
+def _euler(rotations: Array, axes: Array) -> Array:
+    """`[..., 3]` radians about x, y and z of `axes`, in that order, of `[..., 3, 3]`."""
+    axes = jnp.asarray(axes).astype(rotations.dtype)
     m = product(product(jnp.swapaxes(axes, -1, -2), rotations), axes)
     about_x = jnp.arctan2(-m[..., 1, 2], m[..., 2, 2])
     about_y = jnp.arctan2(m[..., 0, 2], jnp.sqrt(m[..., 0, 0] ** 2 + m[..., 0, 1] ** 2))
     about_z = jnp.arctan2(-m[..., 0, 1], m[..., 0, 0])
-    euler = jnp.stack([about_x, about_y, about_z], -1)
-    return euler[..., *EULER] * jnp.asarray(SIGNS).astype(rotations.dtype)
+    return jnp.stack([about_x, about_y, about_z], -1)
 
 
 def forward_kinematics(
-    skeleton: Array, rotations: Array, wrist_rotation: Array, wrist_position: Array
+    skeleton: Array,
+    rotations: Array,
+    wrist_rotation: Array | None = None,
+    wrist_position: Array | None = None,
 ) -> tuple[Array, Array]:
     """Places all points of a skeleton.
 
     Args:
         skeleton: `[..., 21, 3]` metres, each point from its parent in the flat hand.
         rotations: `[..., 15, 3, 3]` parent_from_joint of the finger joints.
-        wrist_rotation: `[..., 3, 3]` world_from_wrist.
+        wrist_rotation: `[..., 3, 3]` world_from_wrist; without it all is in the hand frame.
         wrist_position: `[..., 3]` metres, world.
 
     Returns:
         positions `[..., 21, 3]` metres, world; rotations `[..., 16, 3, 3]` world_from_joint.
     """
-    batch = rotations.shape[:-3]
+    batch, dtype = rotations.shape[:-3], rotations.dtype
+    if wrist_rotation is None or wrist_position is None:
+        wrist_rotation, wrist_position = jnp.eye(3, dtype=dtype), jnp.zeros(3, dtype)
     wrist = jnp.broadcast_to(wrist_position[..., None, :], (*batch, 1, 3))
     wrist_turn = jnp.broadcast_to(wrist_rotation[..., None, :, :], (*batch, 1, 3, 3))
     turn, place = wrist_turn, wrist
@@ -86,6 +94,17 @@ def forward_kinematics(
     return (
         jnp.concatenate([wrist, joints, tips], -2),
         jnp.concatenate([wrist_turn, finger_turns], -3),
+    )
+
+
+def in_world(
+    positions: Array, rotations: Array, wrist_rotation: Array, wrist_position: Array
+) -> tuple[Array, Array]:
+    """Positions `[..., 21, 3]` and rotations `[..., 16, 3, 3]` of the hand frame as the wrist's
+    pose `[..., 3, 3]`, `[..., 3]` has them in the world."""
+    return (
+        transform(wrist_rotation, wrist_position, positions),
+        product(wrist_rotation[..., None, :, :], rotations),
     )
 
 
@@ -109,64 +128,114 @@ def flat_calibrated(rotations: Array, flat: Array) -> Array:
 
 
 def align_fingers(
-    hand: Hand, local: Array, positions: Array, rotations: Array, markers: Array, weight: Array
-) -> Array:
+    hand: Hand, positions: Array, rotations: Array, markers: Array, weight: Array | None = None
+) -> tuple[Array, Array]:
     """Turns each finger about its base until its outermost marker points to where it was measured
     (paper, section 2.2: finger alignment).
+
+    Args:
+        hand: its markers and their offsets.
+        positions: `[..., 21, 3]` metres, as `forward_kinematics` gives them, in any frame.
+        rotations: `[..., 16, 3, 3]` frame_from_joint, likewise.
+        markers: `[..., M, 3]` metres, in that frame; finite where the weight is not 0.
+        weight: `[..., M]` in 0 to 1: the share of the arc that a marker is worth; else all of it.
+
+    Returns:
+        Positions and rotations, as given.
+    """
+    ends, has = hand.end_markers
+    batch = positions.shape[:-2]
+    base = positions[..., 1:16:3, :]
+    modelled = marker_positions(hand, positions, rotations)[..., ends, :] - base
+    share = has.astype(positions.dtype) * (1 if weight is None else weight[..., ends])
+    measured = jnp.where(share[..., None] > 0, markers[..., ends, :] - base, modelled)
+    turn = apart(shortest_arc(modelled, measured, share))
+    fingers = rotations[..., 1:, :, :].reshape(*batch, 5, 3, 3, 3)
+    turned = product(turn[..., None, :, :], fingers).reshape(*batch, 15, 3, 3)
+    beyond = np.array(CHAINS)[:, 1:]
+    arms = positions[..., beyond, :] - base[..., None, :]
+    moved = product(arms, turn.swapaxes(-1, -2)) + base[..., None, :]
+    return (
+        positions.at[..., beyond, :].set(moved),
+        jnp.concatenate([rotations[..., :1, :, :], turned], -3),
+    )
+
+
+def place_fingers(
+    hand: Hand, angles: Array, markers: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """All points of a hand with its fingers at `angles`, and turned about their bases until their
+    outermost markers point to where they were measured (paper, section 2.2: finger alignment).
 
     The paper's middle of the last phalanx is that for a marker placed there. Here the marker's own
     modelled point is taken, so that joints which are right stay as they are, wherever the marker
     sits. What that leaves, the distance from the base, is the matter of `bend_fingers`.
 
     Args:
-        hand: its markers and their offsets.
-        local: `[..., 15, 3, 3]` parent_from_joint of the finger joints.
-        positions: `[..., 21, 3]` metres, world, as `forward_kinematics` makes them of `local`.
-        rotations: `[..., 16, 3, 3]` world_from_joint, likewise.
-        markers: `[..., M, 3]` metres, world; finite where the weight is not 0.
-        weight: `[..., M]` in 0 to 1: the share of the arc that a marker is worth.
+        hand: its markers and bones.
+        angles: `[..., 26]` radians.
+        markers: `[..., M, 3]` metres, hand frame; None turns nothing.
 
     Returns:
-        `[..., 15, 3, 3]` parent_from_joint.
+        angles `[..., 26]` as they now are; positions `[..., 21, 3]` metres and rotations
+        `[..., 16, 3, 3]`, hand frame.
     """
-    ends, has = hand.end_markers
-    base = positions[..., 1:16:3, :]
-    modelled = marker_positions(hand, positions, rotations)[..., ends, :] - base
-    share = weight[..., ends] * has.astype(weight.dtype)
-    measured = jnp.where(share[..., None] > 0, markers[..., ends, :] - base, modelled)
-    turn = shortest_arc(modelled, measured, share)
-    wrist = rotations[..., :1, :, :]
-    turn = product(product(wrist.swapaxes(-1, -2), turn), wrist)
-    return local.at[..., ::3, :, :].set(product(turn, local[..., ::3, :, :]))
+    skeleton = jnp.asarray(hand.skeleton, angles.dtype)
+    positions, rotations = forward_kinematics(skeleton, rotations_from_angles(angles))
+    if markers is not None:
+        positions, rotations = align_fingers(hand, positions, rotations, markers)
+        base = _euler(rotations[..., 1::3, :, :], JOINT_AXES[::3])
+        signs = jnp.asarray(SIGNS[BASE_ANGLES]).astype(angles.dtype)
+        angles = angles.at[..., BASE_ANGLES].set(base * signs)
+    return angles, positions, rotations
 
 
-def bend_fingers(
-    hand: Hand, local: Array, positions: Array, rotations: Array, markers: Array, weight: Array
-) -> Array:
+def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
     """Bends each finger's outer two joints until its outermost marker is as far from the finger's
     base as it was measured.
 
     One rotation at the base, as the paper has it, falls short in a pinch (section 8): the tip's
     distance from the base is wrong too. One damped step over the two flexions, with `BEND_NOISE`
-    and `BEND_PRIOR`, is left to `align_fingers` to point. Takes and gives what that does.
+    and `BEND_PRIOR`, is left to `place_fingers` to point.
+
+    Args:
+        hand: its markers and bones.
+        angles: `[..., 26]` radians.
+        markers: `[..., M, 3]` metres, hand frame.
+
+    Returns:
+        `[..., 26]` radians.
     """
     ends, has = hand.end_markers
-    base = positions[..., 1:16:3, :]
-    modelled = marker_positions(hand, positions, rotations)[..., ends, :]
-    share = weight[..., ends] * has.astype(weight.dtype)
-    way = modelled - base
+    dtype = angles.dtype
+    local = rotations_from_angles(angles)
+    arms = end_arms(hand).astype(dtype)
+    middle, last = local[..., 1::3, :, :], local[..., 2::3, :, :]
+    outer = product(last, arms[:, 2, :, None])[..., 0]
+    inner = product(middle, (arms[:, 1] + outer)[..., None])[..., 0]
+    way = arms[:, 0] + inner
     reach = jnp.sqrt((way * way).sum(-1))
-    target = jnp.where(share[..., None] > 0, markers[..., ends, :] - base, way)
-    short = share * (jnp.sqrt((target * target).sum(-1)) - reach)
     direction = way / jnp.where(reach > 0, reach, 1)[..., None]
-    axes = product(rotations[..., HINGES, :, :], jnp.asarray(HINGE_AXES, local.dtype))[..., 0]
-    arms = modelled[..., None, :] - positions[..., 1 + HINGES, :]
-    carried = jnp.asarray(hand.placing[1][ends][:, None] > HINGES, local.dtype)
-    slopes = (cross(axes, arms) * direction[..., None, :]).sum(-1) * carried
+    signed = SIGNS[FLEXIONS][..., None] * JOINT_AXES.reshape(5, 3, 3, 3)[:, 1:, :, 0]
+    axes = jnp.asarray(signed).astype(dtype)
+    by_last = product(middle, cross(axes[:, 1], outer)[..., None])[..., 0]
+    slopes = jnp.stack([cross(axes[:, 0], inner), by_last], -2)
+    slopes = (slopes * direction[..., None, :]).sum(-1)
+    target = markers[..., ends, :] - jnp.asarray(hand.skeleton, dtype)[1:16:3]
+    short = has.astype(dtype) * (jnp.sqrt((target * target).sum(-1)) - reach)
     damped = (slopes * slopes).sum(-1) + (BEND_NOISE / BEND_PRIOR) ** 2
     bend = jnp.clip(slopes * (short / damped)[..., None], -FARTHEST_BEND, FARTHEST_BEND)
-    bend = bend[..., None, None]
-    turn = jnp.sin(bend) * jnp.asarray(HINGE_CROSS, local.dtype)
-    turn += (1 - jnp.cos(bend)) * jnp.asarray(HINGE_SQUARED, local.dtype)
-    turn += jnp.eye(3, dtype=local.dtype)
-    return local.at[..., HINGES, :, :].set(product(turn, local[..., HINGES, :, :]))
+    return angles.at[..., FLEXIONS].add(bend)
+
+
+def end_arms(hand: Hand) -> Array:
+    """`[5, 3, 3]` metres: the way from each finger's base to its outermost marker, in the three
+    parts that its joints carry, from the base out; 0 where it has none."""
+    ends, has = hand.end_markers
+    joints, links = (places[ends, None] for places in hand.placing)
+    level = np.arange(3)
+    between = (np.array(CHAINS) == joints).argmax(-1)[:, None] > level
+    skeleton, offsets = jnp.asarray(hand.skeleton), jnp.asarray(hand.offsets)
+    bones = jnp.where(between[..., None], skeleton[np.array(CHAINS)[:, 1:]], 0)
+    own = jnp.where(((links - 1) % 3 == level)[..., None], offsets[ends, None], 0)
+    return jnp.where(has[:, None, None] > 0, bones + own, 0)

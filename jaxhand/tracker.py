@@ -1,48 +1,24 @@
 """The pipeline of one frame, as pure `init` and `step`. Twin of `numpy_infer.tracker`.
 
-Register the visible markers → fill the hidden ones → continuity → hand pose from the alignment
-markers → joint angles → calibration → forward kinematics → finger alignment. (The
-gate before is the identity as yet.)
-
-Continuity is a blend at the output. `raw` is measured where visible and predicted from measured
-markers where hidden; in the registered frame `output = raw + correction`. While the visible set is
-unchanged the correction of a visible marker shrinks at 25 cm/s (paper, section 3.2.2) and that of
-a hidden one fades with posture, `exp(−d/δ)`, d the RMS change of the registered visible markers.
-When the set changes, the previous frame is done again with the new set, and what is missing to the
-previous output becomes the correction; so the output goes on from where it was.
+Gate → register the visible markers → fill the hidden ones → continuity → hand pose from the
+alignment markers → joint angles → calibration → forward kinematics → finger alignment. From frame
+to frame: `continuity`.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
-from jaxhand.geometry import (
-    apart,
-    kabsch,
-    mean_point,
-    mirror,
-    mirror_rotation,
-    product,
-    second_extent,
-    transform,
-    untransform,
-)
-from jaxhand.joints import joint_stage
-from jaxhand.predictors import PREDICTORS, learned_step
+from jaxhand import gate
+from jaxhand.continuity import advance
+from jaxhand.geometry import mirror
+from jaxhand.output import hand_pose
+from jaxhand.predictors import PREDICTORS
 from numpy_infer.arrays import Array
 from numpy_infer.model import ERROR_AGES, Model
-from numpy_infer.pose import HandPose, Notice, Redone, State, Status, TrackingState
-from numpy_infer.tracker import (
-    DETERMINED_EXTENT,
-    FARTHEST,
-    HUGE,
-    LONGEST,
-    SAME_POSTURE,
-    SHRINK_SPEED,
-)
+from numpy_infer.pose import HandPose, State
+from numpy_infer.tracker import FARTHEST, LONGEST, SHOWN
 
 
 def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> State:
@@ -66,22 +42,15 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
     dtype, count = template.dtype, len(model.hand)
     eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*batch, 3, 3))
     origin = jnp.zeros((*batch, 3), dtype)
-    lost = jnp.full(batch, int(TrackingState.LOST))
     never = jnp.zeros((*batch, count), bool)
-    pose = HandPose(
-        markers=template,
-        status=jnp.full((*batch, count), int(Status.HELD)),
-        expected_error=jnp.zeros((*batch, count), dtype),
-        wrist_rotation=eye,
-        wrist_position=origin,
-        **joint_stage(model, template, eye, origin),
-        state=lost,
-        notice=jnp.zeros(batch, int),
-    )
     return State(
         right=jnp.broadcast_to(jnp.asarray(right, bool), batch),
+        gate=gate.init(model, batch) if model.gate else (),
+        rejected=never,
         predictor=PREDICTORS[model.predictor].init(model, batch),
-        pose=pose,
+        output=template,
+        wrist_rotation=eye,
+        wrist_position=origin,
         markers=jnp.zeros_like(template),
         visible=never,
         tracked=jnp.zeros(batch, bool),
@@ -111,311 +80,46 @@ def step(
         dt: `[...]` seconds since the previous frame. If it is not positive nothing that runs on
             time moves, and the same markers again change nothing.
     """
+    markers, visible, elapsed, late = _cleaned(state, markers, visible, dt)
+    state = advance(model, state, markers, visible, elapsed, late)
+    return state, hand_pose(model, state, late)
+
+
+def run(
+    model: Model, state: State, markers: Array, visible: Array, dt: Array
+) -> tuple[State, HandPose]:
+    """Takes in many frames at once: what `step` gives one after the other, within rounding.
+
+    Args:
+        model: what to run.
+        state: from `init` or the previous `step` or `run`.
+        markers: `[T, ..., M, 3]` as `step` takes them; one frame or more.
+        visible: `[T, ..., M]` likewise.
+        dt: `[T, ...]` likewise.
+
+    Returns:
+        The state after the last frame; the poses, everything in them with T in front.
+    """
+    markers, visible, elapsed, late = _cleaned(state, markers, visible, dt)
+
+    def frame(state: State, of: tuple[Array, ...]) -> tuple[State, dict[str, Array]]:
+        state = advance(model, state, *of)
+        return state, {name: getattr(state, name) for name in SHOWN}
+
+    # Joints depend on their own frame alone: they are made of all frames at once.
+    state, shown = jax.lax.scan(frame, state, (markers, visible, elapsed, late))
+    right = jnp.broadcast_to(state.right, late.shape)
+    return state, hand_pose(model, state._replace(right=right, **shown), late)
+
+
+def _cleaned(
+    state: State, markers: Array, visible: Array, dt: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Markers of a left hand, 0 where hidden; what is visible of them; seconds that have passed,
+    and where none have."""
     dtype = state.markers.dtype
     visible = visible & (jnp.abs(markers) < FARTHEST).all(-1)
     markers = jnp.where(visible[..., None], markers, 0).astype(dtype)
     markers = jnp.where(state.right[..., None, None], mirror(markers), markers)
     late = ~(dt > 0)
-    elapsed = jnp.where(late, 0, jnp.minimum(dt, LONGEST)).astype(dtype)
-    repeated = (
-        late
-        & state.known.any(-1)
-        & (visible == state.visible).all(-1)
-        & (markers == state.markers).all((-1, -2))
-    )
-    new_state = _track(model, state, markers, visible, elapsed)
-    new_state = _where(repeated, state, new_state)
-    return new_state, _to_side(new_state, _notice(new_state, late))
-
-
-def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State:
-    """The state after a frame of clean input of a left hand; its `pose` is the output."""
-    weight = visible.astype(markers.dtype)
-    template = jnp.asarray(model.hand.template, markers.dtype)
-    tracking = second_extent(markers, weight) > DETERMINED_EXTENT
-    both = visible & state.visible
-    shift = mean_point(markers - state.markers, both.astype(markers.dtype))
-    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
-    rotation, translation = apart(
-        _register(state, template, markers, weight, changed, tracking, shift)
-    )
-    # Before there was any output the template stands in for it.
-    placed = transform(rotation, translation, template)
-    last = jnp.where(state.tracked[..., None, None], state.pose.markers, placed)
-    redone = apart(
-        _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
-    )
-    before = _registration_before(state, redone, changed, rotation, translation)
-    advance, raw = apart(
-        _fill(model, state.predictor, markers, visible, last, dt, (rotation, translation), before)
-    )
-    held = jnp.where(state.tracked[..., None, None], last + shift[..., None, :], placed)
-    raw = jnp.where(tracking[..., None, None], raw, held)
-    raw = jnp.where(visible[..., None], markers, raw)
-    registered = apart(untransform(rotation, translation, raw))
-
-    correction, anchor, seen = state.correction, state.anchor, state.seen
-    restart = (changed & state.tracked)[..., None, None]
-    correction = jnp.where(restart, redone.correction, correction)
-    anchor = jnp.where(restart, redone.anchor, anchor)
-    seen = jnp.where((changed & tracking & state.tracked)[..., None, None], redone.seen, seen)
-    begin = ~state.tracked[..., None, None]
-    prior = jnp.where(restart, redone.prior, state.prior)
-    prior = jnp.where(begin, product(rotation.swapaxes(-1, -2), state.rotation), prior)
-    correction = jnp.where(begin, 0, correction)
-    anchor = jnp.where(begin, registered, anchor)
-    seen = jnp.where(begin & ~visible[..., None], template, seen)
-    seen = jnp.where(visible[..., None], registered, seen)
-    correction, anchor, seen = apart((correction, anchor, seen))
-
-    if model.continuity:
-        correction, blend = _blend(model, correction, anchor, registered, visible, tracking, dt)
-        blended = transform(rotation, translation, registered + blend)
-        raw = jnp.where((blend != 0).any(-1, keepdims=True), blended, raw)
-
-    age = jnp.where(visible, 0, state.age + dt[..., None])
-    new_state = State(
-        right=state.right,
-        predictor=advance,
-        pose=state.pose,
-        markers=markers,
-        visible=visible,
-        tracked=state.tracked | tracking,
-        tracking=tracking,
-        rotation=rotation,
-        translation=translation,
-        seen=seen,
-        known=state.known | visible,
-        correction=correction,
-        anchor=anchor,
-        prior=prior,
-        age=age,
-    )
-    return new_state._replace(pose=_pose(model, new_state, raw))
-
-
-def _register(
-    state: State,
-    template: Array,
-    markers: Array,
-    weight: Array,
-    changed: Array,
-    tracking: Array,
-    shift: Array,
-) -> tuple[Array, Array]:
-    """`world_from_template` of the visible markers; where they do not determine it, the previous
-    one moved along with them, and before there was one, the template at their mean."""
-    found_rotation, found_translation = kabsch(
-        template, markers, weight, lambda: _carried_prior(state, markers, weight, changed)
-    )
-    seen_any = (weight > 0).any(-1)[..., None]
-    centred = mean_point(markers, weight) - mean_point(template, weight)
-    start = jnp.where(seen_any, centred, state.translation)
-    moved = jnp.where(state.tracked[..., None], state.translation + shift, start)
-    rotation = jnp.where(tracking[..., None, None], found_rotation, state.rotation)
-    return rotation, jnp.where(tracking[..., None], found_translation, moved)
-
-
-def _carried_prior(state: State, markers: Array, weight: Array, changed: Array) -> Array:
-    """`[..., 3, 3]` world_from_template that the registration follows where the template's visible
-    markers are near a line. The previous rotation would not do while the set stays the same: each
-    frame would give it up a little more, and a hand that stands still would turn."""
-    turn, _ = kabsch(state.anchor, markers, weight, state.rotation)
-    return jnp.where(changed[..., None, None], state.rotation, product(turn, state.prior))
-
-
-def _fill(
-    model: Model,
-    predictor: Any,
-    markers: Array,
-    visible: Array,
-    last: Array,
-    dt: Array,
-    registration: tuple[Array, Array],
-    before: tuple[Array, Array],
-) -> tuple[Any, Array]:
-    """One step of the model's predictor; the learned one is spared a second registration.
-
-    What a predictor that goes by the frame has nothing to say of moves with the hand: from the
-    registration `before`, of the previous frame by the same markers, to that of this frame.
-    """
-    chosen = PREDICTORS[model.predictor]
-    if chosen.step is learned_step:
-        return learned_step(model, predictor, markers, visible, last, dt, registration)
-    if chosen.uses_frame:
-        last = transform(*registration, untransform(*before, last))
-    return chosen.step(model, predictor, markers, visible, last, dt)
-
-
-def _registration_before(
-    state: State, redone: Redone, changed: Array, rotation: Array, translation: Array
-) -> tuple[Array, Array]:
-    """The previous frame's registration by the markers visible now; this frame's own for a hand
-    that had not been tracked."""
-    parts = (
-        (redone.rotation, state.rotation, rotation),
-        (redone.translation, state.translation, translation),
-    )
-    return tuple(
-        _where(state.tracked, _where(changed, again, earlier), now) for again, earlier, now in parts
-    )
-
-
-def _redo(
-    model: Model,
-    state: State,
-    markers: Array,
-    visible: Array,
-    tracking: Array,
-    shift: Array,
-    last: Array,
-    rotation: Array,
-    translation: Array,
-) -> Redone:
-    """The previous frame, done with this frame's visible set.
-
-    A marker hidden then takes its position of now, carried back by the hand's motion since.
-    """
-    dtype = markers.dtype
-    template = jnp.asarray(model.hand.template, dtype)
-    before = transform(state.rotation, state.translation, state.seen)
-    before = jnp.where(state.visible[..., None], state.markers, before)
-    turn, move = apart(_motion(state, before, markers, visible, tracking, shift))
-    returned = untransform(turn, move, markers)
-    returned = jnp.where(state.visible[..., None], state.markers, returned)
-    previous: Array = apart(jnp.where(visible[..., None], returned, 0))
-    # The prior is that of now, carried back too: if only the set has changed, so has nothing else.
-    prior = product(jnp.swapaxes(turn, -1, -2), state.rotation)
-    found = kabsch(template, previous, visible.astype(dtype), prior)
-    then_rotation = jnp.where(tracking[..., None, None], found[0], state.rotation)
-    then_translation = jnp.where(tracking[..., None], found[1], state.translation)
-    then = (then_rotation, then_translation)
-    _, filled = _fill(
-        model, state.predictor, previous, visible, last, jnp.zeros_like(shift[..., 0]), then, then
-    )
-    raw = jnp.where((tracking[..., None] | visible)[..., None], filled, last)
-    correction = untransform(*then, last) - untransform(*then, raw)
-    seen = untransform(rotation, translation, transform(turn, move, before))
-    followed = product(then_rotation.swapaxes(-1, -2), prior)
-    return Redone(*then, correction, untransform(*then, previous), seen, followed)
-
-
-def _motion(
-    state: State, before: Array, markers: Array, visible: Array, tracking: Array, shift: Array
-) -> tuple[Array, Array]:
-    """The hand's rigid motion since the previous frame, from the markers seen in both.
-
-    What those leave open follows where the visible markers were seen last (`before [..., M, 3]`,
-    carried along with the hand since), if the hand had been lost or if they fit without a change of
-    posture; a posture that has changed says nothing of a rotation, so otherwise there is none.
-    """
-    dtype = markers.dtype
-    both = (visible & state.visible).astype(dtype)
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), state.rotation.shape)
-    earlier = (visible & state.known).astype(dtype)
-    turn, move = kabsch(before, markers, earlier, eye)
-    misfit = mean_point((transform(turn, move, before) - markers) ** 2, earlier).sum(-1)
-    believed = tracking & (~state.tracking | (misfit < SAME_POSTURE**2)) & (earlier > 0).any(-1)
-    turn = jnp.where(believed[..., None, None], turn, eye)
-    move = jnp.where(believed[..., None], move, shift)
-    seen_turn, seen_move = kabsch(before, markers, both, turn)
-    decide = tracking & (both > 0).any(-1)
-    return (
-        jnp.where(decide[..., None, None], seen_turn, turn),
-        jnp.where(decide[..., None], seen_move, move),
-    )
-
-
-def _blend(
-    model: Model,
-    correction: Array,
-    anchor: Array,
-    registered: Array,
-    visible: Array,
-    tracking: Array,
-    dt: Array,
-) -> tuple[Array, Array]:
-    """The corrections to keep, and those to add now; `[..., M, 3]`, registered frame."""
-    length = jnp.sqrt((correction * correction).sum(-1))
-    left = jnp.maximum(length - SHRINK_SPEED * dt[..., None], 0)
-    share = jnp.where(visible & (length > 0), left / jnp.where(length > 0, length, 1), 1)
-    correction = correction * share[..., None]
-    difference = jnp.where(visible[..., None], registered - anchor, 0)
-    seen = jnp.maximum(visible.sum(-1), 1).astype(registered.dtype)
-    distance = jnp.sqrt((difference * difference).sum((-1, -2)) / seen)
-    fade = jnp.where(tracking, jnp.exp(-distance / model.fade), 0)
-    blend = jnp.where(visible[..., None], correction, correction * fade[..., None, None])
-    return correction, blend
-
-
-def _pose(model: Model, state: State, output: Array) -> HandPose:
-    """The output of a frame, for a left hand, from its markers `[..., M, 3]`."""
-    template = jnp.asarray(model.body.template, output.dtype)
-    alignment = jnp.broadcast_to(
-        jnp.asarray(model.hand.alignment_weight, output.dtype), output.shape[:-1]
-    )
-    rotation, position = kabsch(template, output, alignment, state.rotation)
-    uses_frame = PREDICTORS[model.predictor].uses_frame
-    filled = jnp.where(state.tracking & uses_frame, int(Status.PREDICTED), int(Status.HELD))
-    status = jnp.where(state.visible, int(Status.OBSERVED), filled[..., None])
-    seen_any = state.visible.any(-1)
-    degraded = jnp.where(
-        seen_any & state.tracked, int(TrackingState.DEGRADED), int(TrackingState.LOST)
-    )
-    return HandPose(
-        markers=output,
-        status=status,
-        expected_error=_expected_error(model, state.visible, state.age),
-        wrist_rotation=rotation,
-        wrist_position=position,
-        **joint_stage(model, output, rotation, position),
-        state=jnp.where(state.tracking, int(TrackingState.TRACKING), degraded),
-        notice=jnp.zeros(seen_any.shape, int),
-    )
-
-
-def _expected_error(model: Model, visible: Array, age: Array) -> Array:
-    """`[..., M]` metres, from the model's table by number hidden and age."""
-    table = jnp.asarray(model.expected_error, age.dtype)
-    hidden = (~visible).sum(-1)
-    row = table[jnp.clip(hidden, 1, len(table)) - 1][..., None, :]
-    ages = jnp.array(ERROR_AGES, age.dtype)
-    share = jnp.clip((age[..., None] - ages[:-1]) / (ages[1:] - ages[:-1]), 0, 1)
-    error = row[..., 0] + ((row[..., 1:] - row[..., :-1]) * share).sum(-1)
-    return jnp.where(visible, 0, error)
-
-
-def _notice(state: State, late: Array) -> Array:
-    huge = jnp.abs(state.seen).max((-1, -2)) > HUGE
-    flags = jnp.where(huge, int(Notice.SUSPECTED_MILLIMETRES), 0)
-    return flags | jnp.where(late, int(Notice.NON_POSITIVE_DT), 0)
-
-
-def _to_side(state: State, notice: Array) -> HandPose:
-    """The output as the hand's own side has it."""
-    fields: dict[str, Any] = state.pose._asdict()
-    for name, reflect in _REFLECTED.items():
-        value: Array = fields[name]
-        if value is not None:
-            fields[name] = jnp.where(_leading(state.right, value), reflect(value), value)
-    return HandPose(**fields | {"notice": notice})
-
-
-_REFLECTED = {
-    "markers": mirror,
-    "wrist_rotation": mirror_rotation,
-    "wrist_position": mirror,
-    "rotations": mirror_rotation,
-    "positions": mirror,
-}
-
-
-def _where(condition: Array, yes: Any, no: Any) -> Any:
-    """`jnp.where` over equal trees; `condition [...]` is broadcast from the left."""
-
-    return jax.tree.map(lambda a, b: jnp.where(_leading(condition, a), a, b), yes, no)
-
-
-def _leading(condition: Array, values: Array) -> Array:
-    """`condition [...]` with axes of 1 behind, to go with `values [..., …]`."""
-    return condition.reshape(condition.shape + (1,) * (values.ndim - condition.ndim))
+    return markers, visible, jnp.where(late, 0, jnp.minimum(dt, LONGEST)).astype(dtype), late

@@ -74,11 +74,11 @@ def simulated_frames(hand: Hand, seed: int) -> tuple[Frames, Frames]:
     keys = jax.random.split(jax.random.key(seed))
     # As a whole: operation by operation it is compiled for longer.
     simulate = jax.jit(simulation.frames, static_argnames=("hand", "count"))
-    parts = [
+    (markers, angles), held_out = (
         simulate(key, hand, count)
         for key, count in zip(keys, (POSTURES, POSTURES // 10), strict=True)
-    ]
-    return Frames(*parts[0], simulated=1.0), Frames(*parts[1])
+    )
+    return Frames(markers, angles, simulated=1.0), Frames(*held_out)
 
 
 def _sequences(validation: list[Dataset], hand: Hand, seed: int) -> list[Sequence]:

@@ -113,6 +113,9 @@ def parser() -> argparse.ArgumentParser:
     tracked.add_argument(
         "--no-alignment", action="store_true", help="do not turn fingers towards their markers"
     )
+    tracked.add_argument(
+        "--no-gate", action="store_true", help="believe every measurement, wrong ones, too"
+    )
     tracked.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     tracked.set_defaults(run=_track)
 
@@ -215,7 +218,7 @@ def _track(options: argparse.Namespace) -> None:
         model = replace(model, predictor=options.predictor)
     if options.joints:
         model = replace(model, joints=options.joints)
-    model = replace(model, alignment=not options.no_alignment)
+    model = replace(model, alignment=not options.no_alignment, gate=not options.no_gate)
     if options.calibration:
         model = wearer.calibrated(model, wearer.load(options.calibration))
     show = sys.stderr.isatty()
@@ -257,11 +260,14 @@ def _summary(result: Tracked) -> str:
         (Status.OBSERVED, "measured"),
         (Status.PREDICTED, "filled from what was seen in the frame"),
         (Status.HELD, "held: nothing in the frame determined them"),
+        (Status.REJECTED, "measured at a wrong place, it seems, and filled (see --no-gate)"),
     ):
-        lines.append(f"{100 * (status == name).mean():6.2f} % of the markers {text}")
+        share = 100 * (status == name).mean()
+        if share or name != Status.REJECTED:
+            lines.append(f"{share:6.2f} % of the markers {text}")
     if (result.notice & Notice.SUSPECTED_MILLIMETRES).any():
         lines.append("the hand is metres in size: is the file's unit right? see --unit")
-    hidden = status == Status.PREDICTED
+    hidden = (status == Status.PREDICTED) | (status == Status.REJECTED)
     if hidden.any():
         error = 1e3 * result.expected_error[hidden].mean()
         lines.append(f"filled markers are expected to be {error:.0f} mm off on average")

@@ -6,6 +6,7 @@ Points are rows, rotations act on columns: `world = hand @ rotation.T + translat
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -82,6 +83,45 @@ def solve(matrix: Array, vector: Array) -> Array:
     return np.linalg.solve(matrix, vector[..., None])[..., 0]
 
 
+class Pattern(NamedTuple):
+    """Points that others are registered to, and what of them does not depend on those."""
+
+    shares: Array
+    """`[..., 1, N]` the weights as parts of their sum."""
+    mean: Array
+    """`[..., 1, 3]` metres."""
+    spread: Array
+    """`[..., N, 3]` the points from their mean, times their weights; metres."""
+
+
+def pattern(source: Array, weight: Array) -> Pattern:
+    """What `fit` needs of `source [..., N, 3]` and `weight [..., N]`, as `kabsch` takes them."""
+    shares = _shares(weight)
+    mean = shares @ source
+    return Pattern(shares, mean, (source - mean) * weight[..., None])
+
+
+def fit(
+    source: Pattern, target: Array, prior: Array | Callable[[], Array]
+) -> tuple[Array, Array, Array]:
+    """`kabsch` of a pattern whose own part is done, which is half of the work.
+
+    Returns:
+        `rotation [..., 3, 3]`; `translation [..., 3]`; `[...]` the second singular value of the
+        cross-covariance, m²: at most that of the target, times the pattern's largest.
+    """
+    mean = source.shares @ target
+    covariance = (target - mean).swapaxes(-1, -2) @ source.spread
+    values, quaternions = _horn(covariance)
+    second = (values[..., 3] + values[..., 1]) / 2
+    # Twice is enough: `prior_weight` measures at least 1/√3 of it.
+    if (second < 2 * PRIOR_STRENGTH).any():
+        prior = prior() if callable(prior) else prior
+        _, quaternions = _horn(covariance + prior_weight(covariance)[..., None, None] * prior)
+    rotation = _rotation(quaternions)
+    return rotation, (mean - source.mean @ rotation.swapaxes(-1, -2))[..., 0, :], second
+
+
 def kabsch(
     source: Array, target: Array, weight: Array, prior: Array | Callable[[], Array]
 ) -> tuple[Array, Array]:
@@ -100,24 +140,16 @@ def kabsch(
         `rotation [..., 3, 3]` with determinant +1, `translation [..., 3]`. Without points the
         translation is 0.
     """
-    shares = _shares(weight)
-    source_mean, target_mean = shares @ source, shares @ target
-    centred = (target - target_mean) * weight[..., None]
-    covariance = centred.swapaxes(-1, -2) @ (source - source_mean)
-    values, quaternions = _horn(covariance)
-    # The second singular value. Twice is enough: `prior_weight` measures at least 1/√3 of it.
-    if ((values[..., 3] + values[..., 1]) < 4 * PRIOR_STRENGTH).any():
-        prior = prior() if callable(prior) else prior
-        _, quaternions = _horn(covariance + prior_weight(covariance)[..., None, None] * prior)
-    rotation = _rotation(quaternions)
-    return rotation, (target_mean - source_mean @ rotation.swapaxes(-1, -2))[..., 0, :]
+    return fit(pattern(source, weight), target, prior)[:2]
 
 
 def prior_weight(covariance: Array) -> Array:
     """`[...]` how much of the prior to add to a `[..., 3, 3]` cross-covariance, in m²."""
-    cofactors = cross(covariance[..., _NEXT, :], covariance[..., _AFTER, :])
     size = np.sqrt((covariance * covariance).sum((-1, -2)))
-    second = np.sqrt((cofactors * cofactors).sum((-1, -2))) / np.where(size > 0, size, 1)
+    # In parts of its size: its cofactors, squared, would overflow in float32.
+    unit = covariance / np.where(size > 0, size, 1)[..., None, None]
+    cofactors = cross(unit[..., _NEXT, :], unit[..., _AFTER, :])
+    second = np.sqrt((cofactors * cofactors).sum((-1, -2))) * size
     return PRIOR_STRENGTH * np.maximum(0, 1 - second / PRIOR_STRENGTH) ** 2
 
 
@@ -175,24 +207,58 @@ _CROSS_BASIS = np.cross(_EYE[:, None], -_EYE).reshape(3, 9)
 """`[3, 9]` a vector times this is its cross-product matrix."""
 
 
-def shortest_arc(source: Array, target: Array, share: Array) -> Array:
+def shortest_arc(source: Array, target: Array, share: Array | None = None) -> Array:
     """`[..., 3, 3]` the least rotation that turns the direction of `source` into that of `target`,
     or the `share [...]` of it in 0 to 1.
 
     Vectors `[..., 3]` without length turn nothing. Between opposite ones every half turn is least:
     the one about the coordinate axis farthest from them, made perpendicular, is taken.
+
+    Made of two reflections, across the source and across the direction half way to where it goes:
+    no angle has to be known for it.
     """
-    axis: Array = cross(source, target)
-    sine = np.sqrt((axis * axis).sum(-1))
-    cosine = (source * target).sum(-1)
-    opposite = (sine <= 1e-6 * np.abs(cosine)) & (cosine < 0)
-    length = sine
-    if opposite.any():
-        farthest = _EYE.astype(source.dtype)[np.argmin(np.abs(source), -1)]
-        axis = np.where(opposite[..., None], cross(source, farthest), axis)
-        length = np.sqrt((axis * axis).sum(-1))
-    angle = share * np.arctan2(sine, cosine)
-    return rotation_from_vector(axis * (angle / np.where(length > 0, length, 1))[..., None])
+    square, other = _dot(source, source), _dot(target, target)
+    target = target * np.sqrt(square / np.maximum(other, 1e-30))
+    half_way = source + target
+    half_square = _dot(half_way, half_way)
+    # 2 + 2 cos of the angle between them, times the square of their length.
+    if share is not None or (half_square <= 1.5 * square).any():
+        whole = np.ones_like(square[..., 0]) if share is None else share
+        source, half_way, target = _reflected(source, target, whole)
+        square = half_square = np.ones_like(square)
+    turned = target[..., None] * (source / square)[..., None, :]
+    turned -= half_way[..., None] * (half_way / half_square)[..., None, :]
+    turned += turned
+    turned += _EYE.astype(source.dtype, copy=False)
+    return turned
+
+
+def _reflected(source: Array, target: Array, share: Array) -> tuple[Array, Array, Array]:
+    """Unit vectors `[..., 3]`: the source, the middle of that share of the arc, and its end; all
+    the source if there is no arc."""
+    has_arc = (_dot(source, source) > 0) & (_dot(target, target) > 0)
+    source, target = _direction(source), _direction(target)
+    cosine = _dot(source, target)
+    aside = target - cosine * source
+    sine = np.sqrt(_dot(aside, aside))
+    farthest = _EYE.astype(source.dtype)[np.argmin(np.abs(source), -1)]
+    across = farthest - _dot(farthest, source) * source
+    aside = np.where((sine <= 1e-6) & (cosine < 0), across, aside)
+    angle = np.where(has_arc, share[..., None] * np.arctan2(sine, cosine) / 2, 0)
+    # Once more: of nearly opposite ones `aside` is not quite perpendicular.
+    half_way = _direction(np.cos(angle) * source + np.sin(angle) * _direction(aside))
+    return source, half_way, 2 * _dot(half_way, source) * half_way - source
+
+
+def _direction(vector: Array) -> Array:
+    """`[..., 3]` with length 1; what has no length stays without."""
+    length = np.sqrt(_dot(vector, vector))
+    return vector / np.where(length > 0, length, 1)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """`[..., 1]` scalar products of `[..., 3]`."""
+    return (a[..., None, :] @ b[..., None])[..., 0]
 
 
 def quaternion(rotation: Array) -> Array:

@@ -6,7 +6,6 @@ The hand frame is that of OpenXR's wrist: −z towards the fingers, +y out of th
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,6 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from numpy_infer.arrays import Array
+from numpy_infer.formats.json_text import read_json
+from numpy_infer.formats.refusal import refusal
 
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
 
@@ -160,6 +161,11 @@ class Hand:
         return weight
 
     @cached_property
+    def aligned(self) -> Array:
+        """The indices `alignment`, as an array."""
+        return np.array(self.alignment)
+
+    @cached_property
     def finger_markers(self) -> tuple[tuple[int, ...], ...]:
         """For each finger of `FINGERS` the indices of the markers it carries, from its base out."""
         carried: tuple[list[int], ...] = tuple([] for _ in FINGERS)
@@ -180,6 +186,11 @@ class Hand:
     def placing(self) -> tuple[Array, Array]:
         """`[M]` each: `joints` and `links` as arrays."""
         return np.array(self.joints), np.array(self.links)
+
+    @cached_property
+    def extent(self) -> float:
+        """Metres: at least the largest singular value of any of the template's points, centred."""
+        return float(np.linalg.norm(self.template - self.template.mean(0)))
 
     @cached_property
     def size(self) -> float:
@@ -259,9 +270,9 @@ def load_hand(name_or_path: str | Path) -> Hand:
     else:
         raise ValueError(f"no hand {name!r}: expected a hand file or one of {', '.join(bundled())}")
     try:
-        return hand_from_json(json.loads(file.read_text("utf-8")))
-    except (ValueError, RecursionError) as error:  # no UTF-8, no JSON, too deep, no hand
-        raise ValueError(f"{name}: {error}") from None
+        return hand_from_json(read_json(file))
+    except ValueError as error:  # no JSON, no hand
+        raise refusal(name, error) from None
 
 
 def hand_from_json(data: Any) -> Hand:
@@ -351,7 +362,7 @@ def _read_skeleton(data: Any) -> Array:
             raise ValueError(
                 f"no bundled skeleton {data!r}: expected 'adult' or an object of points"
             )
-        data = json.loads(file.read_text("utf-8"))["points"]
+        data = read_json(file)["points"]
     _check_mapping("a skeleton", data, required=set(POINTS), known=set(POINTS))
     return np.array([_numbers(f"joint {point!r}", data[point]) for point in POINTS])
 

@@ -6,18 +6,23 @@ import hashlib
 import io
 import json
 import os
+import re
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib import resources
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from numpy_infer.arrays import Array
+from numpy_infer.formats.json_text import parse_json
+from numpy_infer.formats.refusal import refusal
 from numpy_infer.hand import ANGLES, Hand, hand_from_json
 from numpy_infer.networks import Network, array_shapes, read_spec, write_spec
 
@@ -29,7 +34,7 @@ FORMAT, VERSION = "jaxhand-model", 1
 SIZE_LIMIT = 64 << 20
 """Bytes: more than this, unpacked, is no model of ours and is not read."""
 
-HEADER_LIMIT = 4 << 20
+HEADER_LIMIT = 1 << 20
 """Bytes: more than this is no header of ours."""
 
 ERROR_AGES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0)
@@ -60,6 +65,8 @@ class Model:
     alignment: bool = False
     """Turn the fingers towards their markers after the joint network, see `skeleton`: nearer joints
     for half as much time again, so a choice of whoever runs the model, not of its file."""
+    gate: bool = False
+    """Notice wrong measurements and treat them as hidden, see `gate`. Likewise a choice."""
     wearer: Hand | None = None
     """The same markers on the bones of whoever wears the glove: what joints and wrist pose are made
     with; None stands for `hand`. Comes from a calibration, not from the model file."""
@@ -73,6 +80,11 @@ class Model:
     """`[K, 6]` metres: mean error with 1…K markers hidden, at `ERROR_AGES`."""
     training: Mapping[str, Any] = field(default_factory=dict)
     """Plain data about how the model was made and measured."""
+
+    @cached_property
+    def error_growth(self) -> Array:
+        """`[K, 5]` m/s: how fast `expected_error` grows between `ERROR_AGES`."""
+        return np.diff(self.expected_error) / np.diff(ERROR_AGES)
 
     @property
     def body(self) -> Hand:
@@ -138,6 +150,10 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
     text = json.dumps(header, indent=1).encode()
     buffer = io.BytesIO()
     np.savez(buffer, allow_pickle=False, header=np.frombuffer(text, np.uint8), **arrays)
+    # What could not be read back is not written.
+    _check_directory(buffer)
+    with zipfile.ZipFile(buffer) as archive:
+        _read(archive)
     part = path.with_name(path.name + ".part")
     part.write_bytes(buffer.getvalue())
     os.replace(part, path)
@@ -157,21 +173,48 @@ def load(path: str | Path) -> Model:
     """
     try:
         file = WEIGHTS / f"{path}.npz" if str(path) in bundled() else Path(path)
-        with file.open("rb") as stream, zipfile.ZipFile(stream) as archive:
-            return _read(archive)
+        with file.open("rb") as stream:
+            _check_directory(stream)
+            with zipfile.ZipFile(stream) as archive:
+                return _read(archive)
     except FileNotFoundError:
         raise ValueError(
             f"no model file {path}, and none of the bundled: {', '.join(bundled())}"
         ) from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: {error}") from None
+    except ValueError as error:
+        raise refusal(path, error) from None
     except _DAMAGE as error:
-        raise ValueError(f"{path}: not a model file, or a damaged one: {error}") from None
+        damage = ValueError(f"not a model file, or a damaged one: {error}")
+        raise refusal(path, damage) from None
 
 
-_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, OSError, RuntimeError)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, OSError, RuntimeError, OverflowError)
 """What `zipfile` raises for damaged archives. A RuntimeError is one that says it is encrypted, or
-packed in a way that there is none of."""
+packed in a way that there is none of; an OverflowError, a place that no file has."""
+
+_END = struct.Struct("<4s4H2LH")
+"""The archive's last bytes: signature, two numbers of disks, two of parts, size and place of the
+directory, length of a comment."""
+
+_DIRECTORY_LIMIT = 256 << 10
+"""Bytes: `zipfile` makes an object of each of its entries before any can be refused."""
+
+
+def _check_directory(stream: IO[bytes]) -> None:
+    size = stream.seek(0, os.SEEK_END)
+    if size > SIZE_LIMIT:
+        raise ValueError(f"larger than {SIZE_LIMIT >> 20} MB, which no model is")
+    stream.seek(max(0, size - _END.size - 20))
+    before, tail = stream.read(min(20, max(0, size - _END.size))), stream.read()
+    if len(tail) < _END.size or not tail.startswith(b"PK\5\6"):
+        raise ValueError("not a model file, or a damaged one: it does not end as one")
+    _, *disks, parts, all_parts, length, place, comment = _END.unpack(tail)
+    if before.startswith(b"PK\6\7"):
+        raise ValueError("has a second directory, for archives larger than any model")
+    if any(disks) or parts != all_parts or comment or place + length + _END.size != size:
+        raise ValueError("not a model file, or a damaged one: its directory is not where it says")
+    if length > _DIRECTORY_LIMIT:
+        raise ValueError(f"lists {parts} parts in {length} bytes, which no model has")
 
 
 _PACKED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -187,7 +230,9 @@ def _read(archive: zipfile.ZipFile) -> Model:
         raise ValueError(f"unpacks to more than {SIZE_LIMIT >> 20} MB, which no model does")
     if "header.npy" not in sizes:
         raise ValueError("not a model file: it has no header")
-    header = json.loads(_array(archive, "header", (None,), HEADER_LIMIT, "|u1").tobytes().decode())
+    header = parse_json(
+        _array(archive, "header", (None,), HEADER_LIMIT, "|u1").tobytes(), finite=True
+    )
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise ValueError("not a model file: its header says nothing of " + FORMAT)
     if header.get("version") != VERSION:
@@ -269,23 +314,34 @@ def _array(
         limit = 8 * prod(n or 1 for n in shape) + 1024
     if info.file_size > limit:
         raise ValueError(f"array {name!r}: {info.file_size} bytes, expected at most {limit}")
-    stream = io.BytesIO(archive.read(info))
-    version = np.lib.format.read_magic(stream)
-    if version != (1, 0):
-        raise ValueError(f"array {name!r}: expected npy version (1, 0), found {version}")
-    found, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    with archive.open(info) as part:
+        # One byte more, so that its checksum is looked at; never all, for a part may be longer than
+        # it says.
+        content = part.read(info.file_size + 1)
+    stated = _NPY.match(content)
+    if stated is None or stated.end() != 10 + int.from_bytes(content[8:10], "little"):
+        raise ValueError(f"array {name!r}: expected an npy of version (1, 0) with a plain header")
+    dtype, order, numbers = (text.decode() for text in stated.groups())
+    found = tuple(int(n) for n in numbers.split(",") if n)
     fits = len(found) == len(shape) and all(
         n is None or m == n for m, n in zip(found, shape, strict=True)
     )
     if not fits:
         raise ValueError(f"array {name!r}: expected shape {shape}, found {found}")
-    if dtype.str not in (dtypes or _FLOATS):
+    if dtype not in (dtypes or _FLOATS):
         raise ValueError(f"array {name!r}: expected {dtypes or _FLOATS}, found {dtype}")
-    if prod(found) * dtype.itemsize != info.file_size - stream.tell():
+    if prod(found) * np.dtype(dtype).itemsize != len(content) - stated.end():
         raise ValueError(f"array {name!r}: its shape {found} does not fit its size")
-    stream.seek(0)
-    return np.lib.format.read_array(stream, allow_pickle=False)
+    array = np.frombuffer(content, dtype, offset=stated.end())
+    return array.reshape(found, order="F" if order == "True" else "C").copy("K")
 
+
+_NPY = re.compile(
+    rb"\x93NUMPY\x01\x00(?s:..)\{'descr': '([<>|=]?\w{1,9})', 'fortran_order': (True|False), "
+    rb"'shape': \((|\d{1,18},|\d{1,18}(?:, \d{1,18}){1,3})\), \} *\n"
+)
+"""What `numpy.save` writes before an array, and nothing else that Python could evaluate: no pickle,
+no expression, no depth."""
 
 _FLOATS = ("<f4", "<f8")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,8 @@ class Dropout(NamedTuple):
 
 Layer = Dense | Dropout
 Spec = tuple[Layer, ...]
+Step = tuple[Array, Array, bool]
+"""Kernel `[in, out]`, bias `[out]`, and whether a rectifier follows."""
 LAYERS: dict[str, type[Dense] | type[Dropout]] = {"dense": Dense, "dropout": Dropout}
 
 
@@ -50,6 +53,23 @@ class Network:
     """`[out]` added to the outputs."""
     output_scale: Array
     """`[out]` multiplies the outputs."""
+
+    @cached_property
+    def folded(self) -> tuple[Step, ...]:
+        """The layers with the scaling in their first and last weights, in the weights' dtype: from
+        inputs less their mean to outputs."""
+        steps = _steps(
+            self.spec, {k: np.asarray(array, np.float64) for k, array in self.arrays.items()}
+        )
+        kernel, bias, relu = steps[0]
+        steps = ((kernel / self.input_scale[:, None], bias, relu), *steps[1:])
+        kernel, bias, relu = steps[-1]
+        if relu:  # a scale of any sign, and a shift, only pass through what is linear
+            steps = (*steps, (np.eye(len(bias)), np.zeros(len(bias)), False))
+            kernel, bias, relu = steps[-1]
+        last = (kernel * self.output_scale, bias * self.output_scale + self.output_mean, False)
+        dtype = self.input_mean.dtype
+        return tuple((k.astype(dtype), b.astype(dtype), r) for k, b, r in (*steps[:-1], last))
 
 
 def read_spec(data: Any) -> Spec:
@@ -86,30 +106,41 @@ def array_shapes(spec: Spec, inputs: int) -> dict[str, tuple[int, ...]]:
 
 def apply(spec: Spec, arrays: Mapping[str, Array], inputs: Array) -> Array:
     """`[..., in]` → `[..., out]`: the layers one after the other, as at run time (no dropout)."""
-    x = inputs
-    for i, layer in enumerate(spec):
-        if isinstance(layer, Dense):
-            x = x @ arrays[f"{i}.kernel"] + arrays[f"{i}.bias"]
-            if layer.activation == "relu":
-                x = np.maximum(x, 0)
+    return _run(_steps(spec, arrays), inputs)
+
+
+def _steps(spec: Spec, arrays: Mapping[str, Array]) -> tuple[Step, ...]:
+    return tuple(
+        (arrays[f"{i}.kernel"], arrays[f"{i}.bias"], layer.activation == "relu")
+        for i, layer in enumerate(spec)
+        if isinstance(layer, Dense)
+    )
+
+
+def _run(steps: tuple[Step, ...], x: Array) -> Array:
+    for kernel, bias, relu in steps:
+        x = x @ kernel + bias
+        if relu:
+            x = np.maximum(x, 0)
     return x
 
 
-def predict(network: Network, inputs: Array, known: Array) -> Array:
+def predict(network: Network, inputs: Array, known: Array | None = None) -> Array:
     """Runs a network in the units of its data.
 
     Args:
         inputs: `[..., in]`, finite where known.
         known: `[..., in]` True where the input may be read; elsewhere it enters as 0 after scaling
-            (paper, section 3.2.2), that is, as its mean.
+            (paper, section 3.2.2), that is, as its mean. None: everywhere.
 
     Returns:
         `[..., out]` in the dtype of `inputs`; the layers themselves run in that of the weights.
     """
-    dtype = network.input_mean.dtype
-    scaled = (inputs.astype(dtype) - network.input_mean) / network.input_scale
-    outputs = apply(network.spec, network.arrays, np.where(known, scaled, dtype.type(0)))
-    return (network.output_mean + network.output_scale * outputs).astype(inputs.dtype)
+    mean = network.input_mean
+    centred = inputs.astype(mean.dtype, copy=False) - mean
+    if known is not None:
+        centred = np.where(known, centred, mean.dtype.type(0))
+    return _run(network.folded, centred).astype(inputs.dtype)
 
 
 def _read_layer(i: int, data: Any) -> Layer:

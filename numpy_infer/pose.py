@@ -8,6 +8,10 @@ from typing import Any, NamedTuple
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import quaternion
 
+DETERMINED_EXTENT = 5e-3
+"""Metres: markers whose second extent is smaller are as good as collinear: they do not determine
+the hand's pose."""
+
 
 class Status(IntEnum):
     """What an output marker rests on."""
@@ -39,6 +43,8 @@ class Notice(IntFlag):
     NONE = 0
     NON_POSITIVE_DT = 1
     SUSPECTED_MILLIMETRES = 2
+    REJECTED_MARKERS = 4
+    """The gate refused some; `Status.REJECTED` says which."""
 
 
 class HandPose(NamedTuple):
@@ -78,14 +84,22 @@ class State(NamedTuple):
 
     right: Array
     """`[...]` True for a right hand."""
+    gate: Any
+    """State of the gate; () without one."""
+    rejected: Array
+    """`[..., M]` True where measured but refused."""
     predictor: Any
     """State of the model's predictor."""
-    pose: HandPose
-    """The previous output."""
+    output: Array
+    """`[..., M, 3]` all markers as the previous frame gave them."""
+    wrist_rotation: Array
+    """`[..., 3, 3]` world_from_wrist, likewise."""
+    wrist_position: Array
+    """`[..., 3]` likewise."""
     markers: Array
-    """`[..., M, 3]` the previous measurements; 0 where hidden."""
+    """`[..., M, 3]` the previous measurements; 0 where hidden or refused."""
     visible: Array
-    """`[..., M]` True where the previous frame was measured."""
+    """`[..., M]` True where the previous frame was measured, and accepted."""
     tracked: Array
     """`[...]` True once the hand has been tracked."""
     tracking: Array
@@ -109,17 +123,3 @@ class State(NamedTuple):
     age: Array
     """`[..., M]` seconds since the marker was measured; as old as the table of expected errors goes
     for one that never was."""
-
-
-class Redone(NamedTuple):
-    """The previous frame, done with this frame's visible set."""
-
-    rotation: Array
-    """`[..., 3, 3]` world_from_template."""
-    translation: Array
-    """`[..., 3]` its translation."""
-    correction: Array
-    anchor: Array
-    seen: Array
-    prior: Array
-    """What `State` keeps under these names, but that `seen` is in this frame's registration."""

@@ -18,6 +18,9 @@ from types import ModuleType
 
 import numpy as np
 
+from numpy_infer.formats.json_text import read_json
+from numpy_infer.formats.refusal import refusal, shortened
+
 BUILT_IN = {
     name: f"numpy_infer.formats.{name}"
     for name in ("trc", "qualisys", "plain_csv", "motive", "authors", "bvh")
@@ -167,11 +170,14 @@ def read(
     half read. A file that is not there is the usual FileNotFoundError.
     """
     path = Path(path)
-    if unit is not None and not (np.isfinite(unit) and unit > 0):
+    if unit is not None and not 0 < unit < 1e6:
         raise ValueError(f"unit: expected metres per file unit, got {unit}")
     reader = _reader(path, format)
-    recording: Recording = reader.read(path, unit=unit, left_handed=left_handed)
-    return _relabelled(recording, label_map or {})
+    try:
+        recording: Recording = reader.read(path, unit=unit, left_handed=left_handed)
+        return _relabelled(recording, label_map or {})
+    except ValueError as error:
+        raise refusal(path, error) from None
 
 
 def write(recording: Recording, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
@@ -193,27 +199,28 @@ def write(recording: Recording, path: str | os.PathLike[str], *, overwrite: bool
 def load_label_map(path: str | os.PathLike[str]) -> dict[str, str]:
     """Read {"label in the file": "our name"} from JSON; ValueError says what is wrong in it."""
 
-    def pairs(items: list[tuple[str, object]]) -> dict[str, object]:
-        _check_unique([label for label, _ in items], "label", f"{path}: ")
-        return dict(items)
-
+    path = Path(path)
     try:
-        mapping = json.loads(Path(path).read_text("utf-8-sig"), object_pairs_hook=pairs)
+        mapping = read_json(path)
     except json.JSONDecodeError as error:
         raise ValueError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None
+    except ValueError as error:
+        raise refusal(path, error) from None
     if not isinstance(mapping, dict):
         raise ValueError(f'{path}: expected an object {{"file label": "our name"}}')
     for label, name in mapping.items():
         if not isinstance(name, str):
-            raise ValueError(f"{path}: {label!r}: expected a name, got {name!r}")
+            what = shortened(f"{label!r}: expected a name, got {name!r}")
+            raise ValueError(f"{path}: {what}")
     _check_unique(list(mapping.values()), "name", f"{path}: ")
     return mapping
 
 
 def median_rate(time: np.ndarray, source: object) -> float:
-    """Hz from [T] seconds: the median of 1 / diff over the steps that go forward."""
+    """Hz from [T] seconds: the median of 1 / diff over the steps that go forward, by a nanosecond
+    at least."""
     steps = np.diff(time)
-    steps = steps[steps > 0]
+    steps = steps[steps >= 1e-9]
     if not steps.size:
         raise ValueError(f"{source}: no rate: the file states none and its time never advances")
     return float(np.median(1.0 / steps))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import NamedTuple
+
 import numpy as np
 
 from numpy_infer.arrays import Array
-from numpy_infer.geometry import cross, shortest_arc
-from numpy_infer.hand import ANGLES, JOINTS, POINTS, THUMB_AXES, Hand
+from numpy_infer.geometry import shortest_arc, transform
+from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, POINTS, THUMB_AXES, Hand
 
 
 def _axis(letter: str, joint: str) -> list[float]:
@@ -47,15 +50,32 @@ _SLOT_SQUARED = np.concatenate([CROSS_SQUARED, _NONE])[SLOTS]
 _SLOT_SIGNS = np.append(SIGNS, 0)[SLOTS]
 _SLOT_ANGLES = np.minimum(SLOTS, len(ANGLES) - 1)
 _EYE = np.eye(3)
-_AXES_BACK = np.swapaxes(JOINT_AXES, -1, -2)
 
-HINGES = np.array([[3 * finger + 1, 3 * finger + 2] for finger in range(5)])
-"""`[5, 2]` the outer two joints of each finger, of the fifteen finger joints."""
-HINGE_AXES = JOINT_AXES[HINGES][..., :1]
-"""`[5, 2, 3, 1]` about which they flex, in their parent's frame."""
-HINGE_CROSS = np.stack([_cross_matrix(axis) for axis in HINGE_AXES.reshape(-1, 3)])
-HINGE_CROSS = HINGE_CROSS.reshape(5, 2, 3, 3)
-HINGE_SQUARED = HINGE_CROSS @ HINGE_CROSS
+BASE_ANGLES = np.array([[i for i, a in enumerate(ANGLES) if a.joint == j] for j in JOINTS[1::3]])
+"""`[5, 3]` the angles of each finger's base: about its x, y and z."""
+
+_OUTER = (
+    ("thumb_mcp_flexion", "thumb_mcp_abduction", "thumb_ip_flexion"),
+    *((f"{finger}_pip_flexion", None, f"{finger}_dip_flexion") for finger in FINGERS[1:]),
+)
+_NAMES = [angle.name for angle in ANGLES]
+OUTER_ANGLES = np.array([[_NAMES.index(name or row[0]) for name in row] for row in _OUTER])
+"""`[5, 3]` the angles beyond each finger's base: of its middle joint flexion and abduction, which
+only a thumb has, and flexion of its last joint."""
+FLEXIONS = OUTER_ANGLES[:, [0, 2]]
+
+_TURNING = SIGNS[OUTER_ANGLES] * np.array([[name is not None for name in row] for row in _OUTER])
+_SIGNED_CROSS = np.stack(
+    [
+        (SIGNS[:, None, None] * CROSS)[BASE_ANGLES],
+        _TURNING[..., None, None] * CROSS[OUTER_ANGLES],
+    ],
+    1,
+)
+_SIGNED_SQUARED = _SIGNED_CROSS @ _SIGNED_CROSS
+WAVES = np.stack([np.eye(3) + _SIGNED_SQUARED, -_SIGNED_SQUARED, _SIGNED_CROSS], 3)
+"""`[5, 2, 3, 3, 3, 3]` of the angles at each finger's base, and beyond it: what 1, cosine and sine
+of the angle are worth in its rotation."""
 
 BEND_NOISE, BEND_PRIOR = 2e-3, 0.1
 """Metres and radians: how far a marker may be off, and how far a joint."""
@@ -83,43 +103,66 @@ def angles_from_rotations(rotations: Array) -> Array:
     A rotation that a joint's angles cannot express loses the part they lack. The middle angle of
     the three, abduction, lies in ±π/2: there flexion and twist are one motion and not told apart.
     """
-    dtype = rotations.dtype
-    m = _AXES_BACK.astype(dtype, copy=False) @ rotations @ JOINT_AXES.astype(dtype, copy=False)
-    euler = np.empty(m.shape[:-1], dtype)
+    return _euler(rotations, JOINT_AXES)[..., *EULER] * SIGNS.astype(rotations.dtype)
+
+
+def _euler(rotations: Array, axes: Array) -> Array:
+    """`[..., 3]` radians about x, y and z of `axes`, in that order, of `[..., 3, 3]`."""
+    axes = axes.astype(rotations.dtype, copy=False)
+    m = axes.swapaxes(-1, -2) @ rotations @ axes
+    euler = np.empty(m.shape[:-1], rotations.dtype)
     euler[..., 0] = np.arctan2(-m[..., 1, 2], m[..., 2, 2])
     euler[..., 1] = np.arctan2(m[..., 0, 2], np.sqrt(m[..., 0, 0] ** 2 + m[..., 0, 1] ** 2))
     euler[..., 2] = np.arctan2(-m[..., 0, 1], m[..., 0, 0])
-    return euler[..., *EULER] * SIGNS.astype(dtype)
+    return euler
 
 
 def forward_kinematics(
-    skeleton: Array, rotations: Array, wrist_rotation: Array, wrist_position: Array
+    skeleton: Array,
+    rotations: Array,
+    wrist_rotation: Array | None = None,
+    wrist_position: Array | None = None,
 ) -> tuple[Array, Array]:
     """Places all points of a skeleton.
 
     Args:
         skeleton: `[..., 21, 3]` metres, each point from its parent in the flat hand.
         rotations: `[..., 15, 3, 3]` parent_from_joint of the finger joints.
-        wrist_rotation: `[..., 3, 3]` world_from_wrist.
+        wrist_rotation: `[..., 3, 3]` world_from_wrist; without it all is in the hand frame.
         wrist_position: `[..., 3]` metres, world.
 
     Returns:
         positions `[..., 21, 3]` metres, world; rotations `[..., 16, 3, 3]` world_from_joint.
     """
     batch, dtype = rotations.shape[:-3], rotations.dtype
-    positions = np.empty((*batch, len(POINTS), 3), dtype)
+    # Rotation and place in one matrix: a finger's joints are then two products.
+    links = np.zeros((*batch, 5, 3, 4, 4), dtype)
+    links[..., :3, :3] = rotations.reshape(*batch, 5, 3, 3, 3)
+    links[..., :3, 3] = skeleton[..., 1 : len(JOINTS), :].reshape(*skeleton.shape[:-2], 5, 3, 3)
+    links[..., 3, 3] = 1
+    for level in (1, 2):
+        np.matmul(links[..., level - 1, :, :], links[..., level, :, :], links[..., level, :, :])
+    positions = np.zeros((*batch, len(POINTS), 3), dtype)
     turns = np.empty((*batch, len(JOINTS), 3, 3), dtype)
-    positions[..., 0, :], turns[..., 0, :, :] = wrist_position, wrist_rotation
-    turn, place = turns[..., :1, :, :], positions[..., :1, :]
-    for level in range(3):
-        # The fingers' joints of one level, all at once.
-        here = slice(1 + level, len(JOINTS), 3)
-        place = place + (turn @ skeleton[..., here, :, None])[..., 0]
-        turn = turn @ rotations[..., level::3, :, :]
-        positions[..., here, :], turns[..., here, :, :] = place, turn
-    tips = slice(len(JOINTS), len(POINTS))
-    positions[..., tips, :] = place + (turn @ skeleton[..., tips, :, None])[..., 0]
-    return positions, turns
+    turns[..., 0, :, :] = _EYE
+    turns[..., 1:, :, :] = links[..., :3, :3].reshape(*batch, 15, 3, 3)
+    positions[..., 1 : len(JOINTS), :] = links[..., :3, 3].reshape(*batch, 15, 3)
+    tips = (turns[..., 3::3, :, :] @ skeleton[..., len(JOINTS) :, :, None])[..., 0]
+    positions[..., len(JOINTS) :, :] = positions[..., 3 : len(JOINTS) : 3, :] + tips
+    if wrist_rotation is None or wrist_position is None:
+        return positions, turns
+    return in_world(positions, turns, wrist_rotation, wrist_position)
+
+
+def in_world(
+    positions: Array, rotations: Array, wrist_rotation: Array, wrist_position: Array
+) -> tuple[Array, Array]:
+    """Positions `[..., 21, 3]` and rotations `[..., 16, 3, 3]` of the hand frame as the wrist's
+    pose `[..., 3, 3]`, `[..., 3]` has them in the world."""
+    return (
+        transform(wrist_rotation, wrist_position, positions),
+        wrist_rotation[..., None, :, :] @ rotations,
+    )
 
 
 def marker_positions(hand: Hand, positions: Array, rotations: Array) -> Array:
@@ -141,69 +184,159 @@ def flat_calibrated(rotations: Array, flat: Array) -> Array:
     return flat.swapaxes(-1, -2) @ rotations
 
 
-def align_fingers(
-    hand: Hand, local: Array, positions: Array, rotations: Array, markers: Array, weight: Array
-) -> Array:
-    """Turns each finger about its base until its outermost marker points to where it was measured
-    (paper, section 2.2: finger alignment).
-
-    The paper's middle of the last phalanx is that for a marker placed there. Here the marker's own
-    modelled point is taken, so that joints which are right stay as they are, wherever the marker
-    sits. What that leaves, the distance from the base, is the matter of `bend_fingers`.
-
-    Args:
-        hand: its markers and their offsets.
-        local: `[..., 15, 3, 3]` parent_from_joint of the finger joints.
-        positions: `[..., 21, 3]` metres, world, as `forward_kinematics` makes them of `local`.
-        rotations: `[..., 16, 3, 3]` world_from_joint, likewise.
-        markers: `[..., M, 3]` metres, world; finite where the weight is not 0.
-        weight: `[..., M]` in 0 to 1: the share of the arc that a marker is worth.
-
-    Returns:
-        `[..., 15, 3, 3]` parent_from_joint.
-    """
-    ends, has = hand.end_markers
-    base = positions[..., 1:16:3, :]
-    modelled = marker_positions(hand, positions, rotations)[..., ends, :] - base
-    share = weight[..., ends] * has.astype(weight.dtype)
-    measured = np.where(share[..., None] > 0, markers[..., ends, :] - base, modelled)
-    turn = shortest_arc(modelled, measured, share)
-    wrist = rotations[..., :1, :, :]
-    turn = wrist.swapaxes(-1, -2) @ turn @ wrist
-    local = local.copy()
-    local[..., ::3, :, :] = turn @ local[..., ::3, :, :]
-    return local
-
-
-def bend_fingers(
-    hand: Hand, local: Array, positions: Array, rotations: Array, markers: Array, weight: Array
-) -> Array:
+def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
     """Bends each finger's outer two joints until its outermost marker is as far from the finger's
     base as it was measured.
 
     One rotation at the base, as the paper has it, falls short in a pinch (section 8): the tip's
     distance from the base is wrong too. One damped step over the two flexions, with `BEND_NOISE`
-    and `BEND_PRIOR`, is left to `align_fingers` to point. Takes and gives what that does.
+    and `BEND_PRIOR`, is left to `place_fingers` to point.
+
+    Args:
+        hand: its markers and bones.
+        angles: `[..., 26]` radians.
+        markers: `[..., M, 3]` metres, hand frame.
+
+    Returns:
+        `[..., 26]` radians.
     """
+    forms, dtype = _forms(hand), angles.dtype
+    waves = np.cos(angles[..., OUTER_ANGLES, None, None] * _WAVE_RATES + _WAVE_PHASES)
+    waves = waves.astype(dtype, copy=False)
+    # Value and slope by the middle joint, times the abduction's value; then by the last joint.
+    first = waves[..., 0, :, :, None] * waves[..., 1, :1, None, :]
+    form = first.reshape(*first.shape[:-2], 9) @ forms.square.astype(dtype, copy=False)
+    form = form @ waves[..., 2, :, :].swapaxes(-1, -2)
+    reach = np.sqrt(np.maximum(form[..., :1, 0], 0))
+    slopes = form.reshape(*form.shape[:-2], 4)[..., 2:0:-1] / (2 * np.where(reach > 0, reach, 1))
+    target = markers[..., forms.ends, :] - hand.skeleton[1:16:3].astype(dtype, copy=False)
+    short = np.sqrt((target[..., None, :] @ target[..., None])[..., 0]) - reach
+    if not forms.all_end:
+        short = short * hand.end_markers[1].astype(dtype)[:, None]
+    damped = (slopes[..., None, :] @ slopes[..., None])[..., 0] + (BEND_NOISE / BEND_PRIOR) ** 2
+    bend = slopes * (short / damped)
+    angles = angles.copy()
+    angles[..., FLEXIONS] += np.minimum(np.maximum(bend, -FARTHEST_BEND), FARTHEST_BEND)
+    return angles
+
+
+_WAVE_RATES = np.array([[0, 1, 1], [0, 1, 1]])
+_WAVE_PHASES = np.pi / 2 * np.array([[0, 0, -1], [1, 1, 0]])
+"""`[2, 3]` the angle times one, plus the other, and the cosine of that: 1, cosine and sine of the
+angle, and their derivatives."""
+
+
+def place_fingers(
+    hand: Hand, angles: Array, markers: Array | None = None
+) -> tuple[Array, Array, Array]:
+    """All points of a hand with its fingers at `angles`, and turned about their bases until their
+    outermost markers point to where they were measured (paper, section 2.2: finger alignment).
+
+    The paper's middle of the last phalanx is that for a marker placed there. Here the marker's own
+    modelled point is taken, so that joints which are right stay as they are, wherever the marker
+    sits. What that leaves, the distance from the base, is the matter of `bend_fingers`.
+
+    What `rotations_from_angles` and `forward_kinematics` say of it, in few calls: whatever stands
+    beyond a finger's base is linear in the products of 1, cosine and sine of three angles.
+
+    Args:
+        hand: its markers and bones.
+        angles: `[..., 26]` radians.
+        markers: `[..., M, 3]` metres, hand frame; None turns nothing.
+
+    Returns:
+        angles `[..., 26]` as they now are; positions `[..., 21, 3]` metres and rotations
+        `[..., 16, 3, 3]`, hand frame.
+    """
+    batch, dtype = angles.shape[:-1], angles.dtype
+    forms = _forms(hand)
+    waves = np.cos(angles[..., _FINGER_ANGLES, None] * _WAVE_RATES[0] + _WAVE_PHASES[0])
+    waves = waves.astype(dtype, copy=False)
+    products = waves[..., 0, :, None] * waves[..., 1, None, :]
+    products = (products[..., None] * waves[..., 2, None, None, :]).reshape(*batch, 5, 2, 1, 27)
+    turn = (products[..., 0, :, :] @ _BASE_FORM.astype(dtype, copy=False)).reshape(*batch, 5, 3, 3)
+    own = products[..., 1, :, :] @ forms.beyond.astype(dtype, copy=False)
+    own = own.reshape(*batch, 5, 3, 10)
+    base = hand.skeleton[1:16:3].astype(dtype, copy=False)
+    if markers is not None:
+        modelled = (turn @ own[..., 9:])[..., 0]
+        measured = markers[..., forms.ends, :] - base
+        if not forms.all_end:
+            measured = np.where(hand.end_markers[1][:, None] > 0, measured, modelled)
+        turn = shortest_arc(modelled, measured) @ turn
+        angles = angles.copy()
+        angles[..., BASE_ANGLES] = _euler(turn, JOINT_AXES[::3]) * _BASE_SIGNS.astype(dtype)
+    placed = turn @ own[..., :9]
+    positions = np.zeros((*batch, len(POINTS), 3), dtype)
+    positions[..., 1:16:3, :] = base
+    positions[..., _BEYOND, :] = placed[..., :3].swapaxes(-1, -2) + base[..., None, :]
+    rotations = np.empty((*batch, len(JOINTS), 3, 3), dtype)
+    rotations[..., 0, :, :] = _EYE
+    rotations[..., 1::3, :, :] = turn
+    rotations[..., 2::3, :, :] = placed[..., 3:6]
+    rotations[..., 3::3, :, :] = placed[..., 6:]
+    return angles, positions, rotations
+
+
+_FINGER_ANGLES = np.stack([BASE_ANGLES, OUTER_ANGLES], 1)
+_BASE_SIGNS = SIGNS[BASE_ANGLES]
+_BEYOND = np.array(CHAINS)[:, 1:]
+"""`[5, 3]` the points of each finger after its base."""
+_TURN = "fiab,fjbc,fkcd->fijkad"
+_BASE_FORM = np.einsum(_TURN, *np.moveaxis(WAVES[:, 0], 1, 0)).reshape(5, 27, 9)
+
+
+class _Forms(NamedTuple):
+    """What stands beyond the fingers' bases, linear in products of 1, cosine and sine of the angles
+    `OUTER_ANGLES`, the last one's running fastest."""
+
+    beyond: Array
+    """`[5, 27, 30]` in the base joint's frame, as `[3, 10]`: the points after the base, metres; the
+    rotations of the two joints; the outermost marker, metres."""
+    square: Array
+    """`[5, 9, 3]` m²: the square of that marker's distance from the base."""
+    ends: Array
+    """`[5]` which marker it is."""
+    all_end: bool
+    """True if all fingers have one."""
+
+
+@lru_cache(maxsize=16)
+def _forms(hand: Hand) -> _Forms:
+    first, side, last = np.moveaxis(WAVES[:, 1], 1, 0)
+    middle = np.einsum("fiab,fjbc->fijac", first, side)
+    outer = np.einsum(_TURN, first, side, last)
+    bones = hand.skeleton[_BEYOND]
+    arms = end_arms(hand)
+
+    def point(parts: Array) -> Array:
+        """`[5, 3, 3, 3, 3]` of three parts `[5, 3, 3]`, each carried by a further joint."""
+        form = np.einsum("fijkad,fd->fijka", outer, parts[:, 2])
+        form[:, :, :, 0] += np.einsum("fijac,fc->fija", middle, parts[:, 1])
+        form[:, 0, 0, 0] += parts[:, 0]
+        return form
+
+    columns = np.zeros((5, 3, 3, 3, 3, 10))
+    for n in range(3):
+        columns[..., n] = point(bones * (np.arange(3) <= n)[:, None])
+    columns[:, :, :, 0, :, 3:6], columns[..., 6:9] = middle, outer
+    columns[..., 9] = point(arms)
+    out = np.einsum("fkcd,fd->fkc", last, arms[:, 2])
+    square = 2 * np.einsum("fa,fijac,fkc->fijk", arms[:, 0], middle, out)
+    square[..., 0] += 2 * np.einsum("fa,fijac,fc->fij", arms[:, 0], middle, arms[:, 1])
+    square[:, 0, 0] += 2 * np.einsum("fc,fkc->fk", arms[:, 1], out)
+    square[:, 0, 0, 0] += (arms * arms).sum((-1, -2))
     ends, has = hand.end_markers
-    base = positions[..., 1:16:3, :]
-    modelled = marker_positions(hand, positions, rotations)[..., ends, :]
-    share = weight[..., ends] * has.astype(weight.dtype)
-    way = modelled - base
-    reach = np.sqrt((way * way).sum(-1))
-    target = np.where(share[..., None] > 0, markers[..., ends, :] - base, way)
-    short = share * (np.sqrt((target * target).sum(-1)) - reach)
-    direction = way / np.where(reach > 0, reach, 1)[..., None]
-    axes = (rotations[..., HINGES, :, :] @ HINGE_AXES.astype(local.dtype, copy=False))[..., 0]
-    arms = modelled[..., None, :] - positions[..., 1 + HINGES, :]
-    carried = (hand.placing[1][ends][:, None] > HINGES).astype(local.dtype)
-    slopes = (cross(axes, arms) * direction[..., None, :]).sum(-1) * carried
-    damped = (slopes * slopes).sum(-1) + (BEND_NOISE / BEND_PRIOR) ** 2
-    bend = slopes * (short / damped)[..., None]
-    bend = np.minimum(np.maximum(bend, -FARTHEST_BEND), FARTHEST_BEND)[..., None, None]
-    turn = np.sin(bend) * HINGE_CROSS.astype(local.dtype, copy=False)
-    turn += (1 - np.cos(bend)) * HINGE_SQUARED.astype(local.dtype, copy=False)
-    turn += _EYE.astype(local.dtype, copy=False)
-    local = local.copy()
-    local[..., HINGES, :, :] = turn @ local[..., HINGES, :, :]
-    return local
+    return _Forms(columns.reshape(5, 27, 30), square.reshape(5, 9, 3), ends, bool(has.all()))
+
+
+def end_arms(hand: Hand) -> Array:
+    """`[5, 3, 3]` metres: the way from each finger's base to its outermost marker, in the three
+    parts that its joints carry, from the base out; 0 where it has none."""
+    ends, has = hand.end_markers
+    joints, links = (places[ends, None] for places in hand.placing)
+    level = np.arange(3)
+    between = (np.array(CHAINS) == joints).argmax(-1)[:, None] > level
+    bones = hand.skeleton[np.array(CHAINS)[:, 1:]] * between[..., None]
+    own = hand.offsets[ends, None] * ((links - 1) % 3 == level)[..., None]
+    return has[:, None, None] * (bones + own)

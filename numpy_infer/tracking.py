@@ -1,9 +1,10 @@
-"""A whole recording through the tracker, frame by frame as it would be live."""
+"""A whole recording through the tracker, with what it would say live."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,12 @@ import numpy as np
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
 from numpy_infer.model import Model
-from numpy_infer.pose import Status, TrackingState
+from numpy_infer.pose import HandPose, Status, TrackingState
 from numpy_infer.recordings import Recording
-from numpy_infer.tracker import HandTracker
+from numpy_infer.tracker import init, run
+
+CHUNK = 1024
+"""Frames done at once, between two reports."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +56,15 @@ def track(
         ValueError: a marker of the model's hand is not in the recording.
     """
     recording = recording.select(model.hand.markers)
-    frames = _run(HandTracker(model, right=right), recording, recording.markers, report)
-    return _tracked(recording, model, *frames)
+    visible = np.isfinite(recording.markers).all(-1)
+    steps = np.diff(recording.time, prepend=recording.time[0] - 1 / recording.rate)
+    state, poses = init(model, (), right), []
+    for first in range(0, len(steps), CHUNK):
+        frames = slice(first, first + CHUNK)
+        state, pose = run(model, state, recording.markers[frames], visible[frames], steps[frames])
+        poses.append(pose)
+        report(min(1.0, frames.stop / len(steps)))
+    return _tracked(recording, model, poses)
 
 
 def track_hands(
@@ -63,7 +74,7 @@ def track_hands(
     right: Sequence[bool],
     report: Callable[[float], None] = lambda share: None,
 ) -> list[Tracked]:
-    """Runs one tracker over several hands at once: all in one product per layer of the networks.
+    """Runs a tracker over each of several hands.
 
     Args:
         recordings: of one hand each, over the same time; see `track`.
@@ -79,12 +90,14 @@ def track_hands(
     hands = [recording.select(model.hand.markers) for recording in recordings]
     if any(not np.array_equal(hand.time, hands[0].time) for hand in hands):
         raise ValueError("expected recordings of the same frames at the same time")
-    markers = np.stack([hand.markers for hand in hands], 1)
-    frames = _run(HandTracker(model, right=right), hands[0], markers, report)
     return [
-        _tracked(hand, model, *(None if array is None else array[:, i] for array in frames))
-        for i, hand in enumerate(hands)
+        track(hand, model, right=side, report=partial(_part, report, number, len(hands)))
+        for number, (hand, side) in enumerate(zip(hands, right, strict=True))
     ]
+
+
+def _part(report: Callable[[float], None], number: int, of: int, share: float) -> None:
+    report((number + share) / of)
 
 
 def prefixed(recording: Recording, prefix: str, hand: Hand) -> Recording:
@@ -98,35 +111,12 @@ def prefixed(recording: Recording, prefix: str, hand: Hand) -> Recording:
     return replace(own, names=hand.markers, filled=filled)
 
 
-def _run(
-    tracker: HandTracker,
-    recording: Recording,
-    markers: Array,
-    report: Callable[[float], None],
-) -> tuple[Any, ...]:
-    """`[T, …]` markers, angles, status, expected error, state and notice, as live."""
-    steps = np.diff(recording.time, prepend=recording.time[0] - 1 / recording.rate)
-    poses = []
-    for i, frame in enumerate(markers):
-        pose = tracker.step(frame, steps[i])
-        kept = pose.markers, pose.angles, pose.status, pose.expected_error, pose.state, pose.notice
-        poses.append(kept)
-        if i % 256 == 0:
-            report(i / len(markers))
-    report(1.0)
-    return tuple(None if f[0] is None else np.array(f) for f in zip(*poses, strict=True))
+def _tracked(recording: Recording, model: Model, poses: Sequence[HandPose]) -> Tracked:
+    def of(name: str) -> Any:
+        parts = [getattr(pose, name) for pose in poses]
+        return None if parts[0] is None else np.concatenate(parts)
 
-
-def _tracked(
-    recording: Recording,
-    model: Model,
-    markers: Array,
-    angles: Array | None,
-    status: Array,
-    expected_error: Array,
-    state: Array,
-    notice: Array,
-) -> Tracked:
+    markers, angles, status, state = (of(name) for name in ("markers", "angles", "status", "state"))
     begun = np.logical_or.accumulate(state == TrackingState.TRACKING)
     if model.predictor == "none":
         markers = np.where((status == Status.OBSERVED)[..., None], markers, np.nan)
@@ -137,4 +127,5 @@ def _tracked(
         joints=None,
         filled=recording.names,
     )
-    return Tracked(filled, status, np.where(begun[:, None], expected_error, 0), state, notice)
+    expected_error = np.where(begun[:, None], of("expected_error"), 0)
+    return Tracked(filled, status, expected_error, state, of("notice"))

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from numpy_infer.arrays import Array
+from numpy_infer.formats.json_text import read_json
+from numpy_infer.formats.refusal import refusal
 from numpy_infer.hand import ANGLES, FINGERS, Hand, hand_from_json
 from numpy_infer.model import Model
 from numpy_infer.networks import Network
@@ -61,11 +63,11 @@ def load(path: str | Path) -> Wearer:
         ValueError: no such file, or one that is damaged; the message says where.
     """
     try:
-        return _read(json.loads(Path(path).read_text("utf-8")))
+        return _read(read_json(Path(path)))
     except FileNotFoundError:
         raise ValueError(f"no calibration file {path}") from None
-    except (ValueError, RecursionError) as error:  # no UTF-8, no JSON, too deep, no calibration
-        raise ValueError(f"{path}: {error}") from None
+    except ValueError as error:  # no JSON, no calibration
+        raise refusal(path, error) from None
 
 
 def _read(data: Any) -> Wearer:

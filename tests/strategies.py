@@ -3,27 +3,19 @@ in few shapes (each new one is a compilation). Laws cast them to the precision u
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from numpy_infer.hand import ANGLES
+from jaxhand.strategies import HIGH, LOW, directions, joint_angles, rotations, turn, vectors  # noqa: F401
+from jaxhand.strategies import rigid_motions as motions
 
 Array = np.ndarray
 
 SPREAD = 6e-3
 """Metres: what counts as spread out here; the library promises from 5 mm on."""
-
-LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
-
-
-def turn(axis: Any, angle: float) -> Array:
-    """`[3, 3]` rotation by `angle` radians about `axis` (Rodrigues), the tests' own."""
-    x, y, z = np.asarray(axis, float) / np.linalg.norm(axis)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
 def extents(points: Array) -> Array:
@@ -44,30 +36,9 @@ def noise(shape: tuple[int, ...]) -> st.SearchStrategy[Array]:
     return seeds.map(lambda seed: np.random.default_rng(seed).uniform(-1, 1, shape))
 
 
-def directions() -> st.SearchStrategy[Array]:
-    """Unit vectors."""
-    vectors = st.tuples(*[st.integers(-9, 9)] * 3).filter(any)
-    return vectors.map(lambda v: np.array(v) / np.linalg.norm(v))
-
-
-def rotations(largest: float = np.pi) -> st.SearchStrategy[Array]:
-    """Rotations by up to `largest` radians, often near the identity or near `largest`."""
-    angles = st.one_of(
-        st.sampled_from([0, 1e-9, 1e-5, 1e-3]),
-        st.sampled_from([0, 1e-9, 1e-5, 1e-3]).map(lambda x: largest - x),
-        st.integers(0, 1000).map(lambda x: x / 1000 * largest),
-    )
-    return st.builds(turn, directions(), angles)
-
-
 def translations() -> st.SearchStrategy[Array]:
     """Up to 3 m along each axis."""
-    return grid(3, 3)
-
-
-def motions() -> st.SearchStrategy[tuple[Array, Array]]:
-    """Rigid motions `(rotation, translation)`."""
-    return st.tuples(rotations(), translations())
+    return vectors(3)
 
 
 def spread_points(count: int = 9) -> st.SearchStrategy[Array]:
@@ -109,12 +80,6 @@ def masks(count: int = 9) -> st.SearchStrategy[Array]:
 def weights(count: int = 9) -> st.SearchStrategy[Array]:
     """`[count]` weights, many of them 0."""
     return hnp.arrays(np.int64, count, elements=st.integers(0, 4)).map(lambda w: w / 2)
-
-
-def joint_angles(inside: float = 1.0) -> st.SearchStrategy[Array]:
-    """`[26]` radians in the ranges of `hand.ANGLES`, shrunk about their middles by `inside`."""
-    fractions = hnp.arrays(np.int64, len(ANGLES), elements=st.integers(-100, 100))
-    return fractions.map(lambda x: (LOW + HIGH) / 2 + x / 100 * inside * (HIGH - LOW) / 2)
 
 
 class Registration(NamedTuple):

@@ -1,46 +1,27 @@
-"""Streams of markers as the tracker sees them, built with numpy out of a drawn seed.
-
-Axes are `[frames, hands, M, …]`. Postures come from random joint angles through the skeleton, so
-they are a hand's; what is visible is drawn apart, and includes every singular neighbourhood: first
-frames incomplete or empty, all hidden, one or two left, three on a line, sets new in every frame.
-"""
+"""Models with random networks, and motion and gaps out of a seed, where a test needs long streams
+of a kind; those that Hypothesis draws are `jaxhand.strategies`' own. Axes: `[T, hands, M, …]`."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
-from strategies import HIGH, LOW, turn
 
+from jaxhand.strategies import HIGH, LOW, Stream, at_least, place, turn  # noqa: F401
+from jaxhand.trial import leaves
 from numpy_infer import tracker
+from numpy_infer.continuity import SHRINK_SPEED
 from numpy_infer.hand import ANGLES, Hand, load_hand
 from numpy_infer.model import Model
 from numpy_infer.networks import Dense, Dropout, Network, array_shapes
-from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
 Array = np.ndarray
 
 LAYOUTS = ("glove9", "dense19", "qualisys13")
-SPEED = 0.25
+SPEED = SHRINK_SPEED
 """m/s that continuity allows."""
-
-
-class Stream(NamedTuple):
-    """Hands in time."""
-
-    truth: Array
-    """`[T, H, M, 3]` metres, world: where the markers are."""
-    visible: Array
-    """`[T, H, M]` True where measured."""
-    dt: Array
-    """`[T, H]` seconds since the previous frame."""
-
-    @property
-    def markers(self) -> Array:
-        """`[T, H, M, 3]` what is measured, NaN where hidden."""
-        return np.where(self.visible[..., None], self.truth, np.nan)
 
 
 def seeds() -> st.SearchStrategy[int]:
@@ -111,14 +92,6 @@ def postures(hand: Hand, rng: np.random.Generator, frames: int, hands: int) -> A
     """`[T, H, M, 3]` metres, hand frame: fingers that bend and spread, about twice a second."""
     fractions = smooth(rng, frames, 15, (hands, len(ANGLES)))
     return place(hand, (LOW + HIGH) / 2 + fractions * (HIGH - LOW) / 2)
-
-
-def place(hand: Hand, angles: Array) -> Array:
-    """`[..., M, 3]` metres, hand frame, of `[..., 26]` radians."""
-    eye = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
-    origin = np.zeros((*angles.shape[:-1], 3))
-    positions = forward_kinematics(hand.skeleton, rotations_from_angles(angles), eye, origin)
-    return marker_positions(hand, *positions)
 
 
 def paths(rng: np.random.Generator, frames: int, hands: int) -> tuple[Array, Array]:
@@ -195,40 +168,6 @@ def fading(rng: np.random.Generator, shape: tuple[int, int, int]) -> Array:
 PATTERNS = {f.__name__: f for f in (markov, blocks, restless, alternating, fading)}
 
 
-def at_least(visible: Array, number: int, rng: np.random.Generator) -> Array:
-    """The same with markers added, where fewer than `number` were visible, until they are."""
-    rank = np.argsort(np.argsort(rng.uniform(size=visible.shape) - visible, -1), -1)
-    return visible | (rank < number)
-
-
-FIRST = ("complete", "incomplete", "empty")
-
-
-@st.composite
-def streams(
-    draw: st.DrawFn,
-    hand: Hand,
-    frames: int = 50,
-    hands: int = 4,
-    least: int = 0,
-    first: tuple[str, ...] = FIRST,
-) -> Stream:
-    """Hands in motion under every pattern of gaps, at a varying frame rate."""
-    rng = np.random.default_rng(draw(seeds()))
-    shape = (frames, hands, len(hand))
-    visible = PATTERNS[draw(st.sampled_from(sorted(PATTERNS)))](rng, shape)
-    visible = at_least(visible, least, rng)
-    match draw(st.sampled_from(first)):
-        case "complete":
-            visible[0] = True
-        case "incomplete":
-            visible[0] = at_least(rng.uniform(size=shape[1:]) < 0.5, least, rng)
-        case "empty":
-            visible[0] = False
-    dt = rng.choice([1 / 60, 1 / 120, 0.003, 0.1], size=shape[:2], p=[0.7, 0.1, 0.1, 0.1])
-    return Stream(motion(hand, rng, frames, hands), visible, dt)
-
-
 # -- running ------------------------------------------------------------------------------------
 
 
@@ -252,13 +191,6 @@ def run(
     parts = zip(*poses, strict=True)
     stacked = [None if part[0] is None else np.stack(part) for part in parts]
     return tracker.HandPose(*stacked), state
-
-
-def leaves(tree: Any) -> list[Array]:
-    """The arrays of a state or an output, in order."""
-    if isinstance(tree, tuple):
-        return [leaf for part in tree for leaf in leaves(part)]
-    return [] if tree is None else [np.asarray(tree)]
 
 
 def assert_same_bits(one: Any, other: Any) -> None:

@@ -20,11 +20,20 @@ from numpy_infer.cli import VERBS
 
 ROOT = Path(numpy_infer.__file__).resolve().parents[1]
 
-TWINS = ("geometry", "skeleton", "networks", "predictors", "joints", "tracker")
+TWINS = (
+    *("geometry", "skeleton", "networks", "predictors", "joints", "output", "gate", "continuity"),
+    "tracker",
+)
 
 ONE_SIDED = {
     # What XLA must be told about small matrix products; numpy has `@`.
-    "geometry": {"apart", "inner", "product"},
+    # And halves of `kabsch`, for the pipeline of one frame; XLA takes apart what it compiles.
+    "geometry": {"apart", "inner", "product", "pattern", "fit"},
+    # An IMU glove's rotations are no angles; the runtime has its fingers from angles.
+    "skeleton": {"align_fingers"},
+    # Many steady frames at once: JAX scans over them.
+    "continuity": {"together", "each"},
+    "gate": {"quietly", "reach"},  # and a table that both sides share
     # The spec and its file format exist once, in numpy; the flax module only beside JAX.
     "networks": {
         *("array_shapes", "read_spec", "write_spec"),

@@ -61,6 +61,10 @@ def test_the_python_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     try:
         for block in blocks("python"):
             exec(compile(block, "README.md", "exec"), space)
+        suite = [name for name in space if name.startswith("test_")]
+        assert suite
+        for name in suite:
+            space[name]()  # type: ignore[operator]
     finally:
         PREDICTORS.pop("mine", None)
     assert np.isfinite(space["pose"].markers).all()  # type: ignore[attr-defined]

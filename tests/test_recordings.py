@@ -280,7 +280,7 @@ def test_a_label_map_is_read_from_json(tmp_path: Path) -> None:
         ('{"a": "b",\n}', r"map\.json:2: not JSON"),
         ('["a"]', "expected an object"),
         ('{"a": 1}', "'a': expected a name, got 1"),
-        ('{"a": "b", "a": "c"}', "duplicate label 'a'"),
+        ('{"a": "b", "a": "c"}', "duplicate entry 'a'"),
         ('{"a": "c", "b": "c"}', "duplicate name 'c'"),
     ],
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -11,8 +10,8 @@ from conftest import REFERENCE, Side
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from numpy.testing import assert_allclose, assert_array_equal
-from strategies import HIGH, LOW, Array, joint_angles, motions, turn, weights
+from numpy.testing import assert_allclose
+from strategies import HIGH, LOW, Array, joint_angles, motions, turn
 
 from numpy_infer import hand as h
 
@@ -237,177 +236,6 @@ def test_all_sides_give_the_same_numbers(
         rtol=0,
         atol=metres,
     )
-
-
-# -- finger alignment ---------------------------------------------------------------------------
-
-HANDS = {name: h.load_hand(name) for name in h.bundled()}  # once: JAX compiles for each object
-GLOVE = HANDS["glove9"]
-
-
-def with_markers_on_last_phalanges() -> h.Hand:
-    """`glove9` with its tip markers in the middle of the last bones."""
-    data = GLOVE.to_json()
-    del data["template"]
-    for marker in data["markers"]:
-        if marker["name"].endswith("_tip"):
-            bone = GLOVE.skeleton[h.POINTS.index(marker["name"])]
-            marker["offset"] = (-bone / 2).tolist()
-    return h.hand_from_json(data)
-
-
-ON_PHALANGES = with_markers_on_last_phalanges()
-
-
-class Posed(NamedTuple):
-    """A hand as the pipeline has it before alignment, and its own markers."""
-
-    local: Array
-    positions: Array
-    rotations: Array
-    markers: Array
-
-
-def posed(side: Side, hand: h.Hand, angles: Array, motion: tuple[Array, Array]) -> Posed:
-    local = side.skeleton.rotations_from_angles(angles)
-    placed = side.skeleton.forward_kinematics(hand.skeleton, local, *motion)
-    return Posed(local, *placed, side.skeleton.marker_positions(hand, *placed))
-
-
-def again(side: Side, hand: h.Hand, local: Array, motion: tuple[Array, Array]) -> Posed:
-    placed = side.skeleton.forward_kinematics(hand.skeleton, local, *motion)
-    return Posed(local, *placed, side.skeleton.marker_positions(hand, *placed))
-
-
-def aligned(side: Side, hand: h.Hand, pose: Posed, markers: Array, weight: Array) -> Array:
-    """Bent, then turned, each from forward kinematics of its own."""
-    local = side.skeleton.bend_fingers(hand, *pose[:3], markers, weight)
-    wrist = pose.rotations[..., 0, :, :], pose.positions[..., 0, :]
-    bent = again(side, hand, local, wrist)
-    return side.skeleton.align_fingers(hand, *bent[:3], markers, weight)
-
-
-@pytest.mark.parametrize("name", h.bundled())
-@given(angles=joint_angles(), motion=motions(), weight=weights(19))
-def test_alignment_leaves_exact_joints_as_they_are(
-    side: Side, name: str, angles: Array, motion: tuple[Array, Array], weight: Array
-) -> None:
-    hand = HANDS[name]
-    pose = posed(side, hand, angles, motion)
-    found = aligned(side, hand, pose, pose.markers, weight[: len(hand)] / 2)
-    # float32: a metre or so from the origin, over a finger's length
-    tolerance = 1e-9 if side.dtype == np.float64 else 1e-4
-    assert_allclose(found, pose.local, rtol=0, atol=tolerance)
-
-
-@given(angles=joint_angles(0.8), other=joint_angles(0.8), motion=motions())
-def test_an_aligned_finger_points_to_its_marker_and_is_turned_as_little_as_can_be(
-    side: Side, angles: Array, other: Array, motion: tuple[Array, Array]
-) -> None:
-    pose = posed(side, GLOVE, angles, motion)
-    measured = posed(side, GLOVE, other, motion).markers
-    local = side.skeleton.align_fingers(GLOVE, *pose[:3], measured, np.ones(len(GLOVE)))
-    found = again(side, GLOVE, local, motion)
-    for finger in range(5):
-        base, end = pose.positions[1 + 3 * finger], GLOVE.finger_markers[finger][-1]
-        want, have = measured[end] - base, found.markers[end] - base
-        crossed = np.linalg.norm(np.cross(want, have))
-        assert crossed / np.linalg.norm(want) < 10 * side.metres
-        assert want @ have > 0
-        before = pose.markers[end] - base
-        angle = np.arctan2(np.linalg.norm(np.cross(before, want)), before @ want)
-        turned = local[3 * finger].astype(float) @ pose.local[3 * finger].T.astype(float)
-        assert_allclose(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)), angle, atol=2e-3)
-    # All else is as it was.
-    rest = [j for j in range(15) if j % 3]
-    assert_array_equal(local[rest], pose.local[rest])
-
-
-@given(angles=joint_angles(0.8), other=joint_angles(0.8))
-def test_the_papers_middle_of_the_last_phalanx_is_a_marker_placed_there(
-    side: Side, angles: Array, other: Array
-) -> None:
-    """p_mr = (p3 + p2) / 2, about p0, by the shortest arc (paper, section 2.2)."""
-    hand = ON_PHALANGES
-    pose = posed(side, hand, angles, (EYE, ORIGIN))
-    measured = posed(side, hand, other, (EYE, ORIGIN)).markers
-    local = side.skeleton.align_fingers(hand, *pose[:3], measured, np.ones(len(hand)))
-    for finger in range(1, 5):
-        base, _, last, tip = h.CHAINS[finger]
-        middle = (pose.positions[last] + pose.positions[tip]) / 2 - pose.positions[base]
-        target = measured[hand.finger_markers[finger][-1]] - pose.positions[base]
-        arc = side.geometry.shortest_arc(middle, target, np.ones(()))
-        expected = arc @ pose.local[3 * finger]
-        assert_allclose(local[3 * finger], expected, rtol=0, atol=20 * side.metres)
-
-
-@given(angles=joint_angles(0.8), other=joint_angles(0.8), motion=motions())
-def test_a_hidden_marker_pulls_nothing_and_cannot_matter(
-    side: Side, angles: Array, other: Array, motion: tuple[Array, Array]
-) -> None:
-    pose = posed(side, GLOVE, angles, motion)
-    measured = posed(side, GLOVE, other, motion).markers
-    hidden = GLOVE.markers.index("index_tip")
-    weight = np.ones(len(GLOVE))
-    weight[hidden] = 0
-    one = aligned(side, GLOVE, pose, measured, weight)
-    holed = measured.copy()
-    holed[hidden] = np.nan
-    assert_array_equal(aligned(side, GLOVE, pose, holed, weight), one)
-    assert_allclose(one[3:6], pose.local[3:6], rtol=0, atol=side.metres)
-    assert np.isfinite(one).all()
-
-
-def test_alignment_is_defined_for_opposite_and_for_no_directions(side: Side) -> None:
-    pose = posed(side, GLOVE, FLAT, (EYE, ORIGIN))
-    index, middle = (GLOVE.markers.index(f"{f}_tip") for f in ("index", "middle"))
-    measured = np.array(pose.markers)
-    base = pose.positions[h.POINTS.index("index_mcp")]
-    measured[index] = 2 * base - measured[index]
-    measured[middle] = pose.positions[h.POINTS.index("middle_mcp")]
-    local = aligned(side, GLOVE, pose, measured, np.ones(len(GLOVE)))
-    assert np.isfinite(local).all()
-    found = again(side, GLOVE, local, (EYE, ORIGIN))
-    assert_allclose(found.markers[index], measured[index], atol=10 * side.metres)
-    assert_allclose(local[6:9], pose.local[6:9], rtol=0, atol=side.metres)
-
-
-def test_a_bent_finger_comes_where_one_rotation_at_its_base_does_not_bring_it(side: Side) -> None:
-    """From estimates that are off by some 10° at each joint."""
-    rng = np.random.default_rng(0)
-    middle, reach = (LOW + HIGH) / 2, 0.6 * (HIGH - LOW) / 2
-    true = middle + rng.uniform(-1, 1, (200, 26)) * reach
-    guess = true + np.radians(10) * rng.standard_normal(true.shape)
-    still = np.broadcast_to(EYE, (200, 3, 3)), np.zeros((200, 3))
-    pose, truth = posed(side, GLOVE, guess, still), posed(side, GLOVE, true, still)
-    weight = np.ones((200, len(GLOVE)))
-    turned = side.skeleton.align_fingers(GLOVE, *pose[:3], truth.markers, weight)
-    stiff = again(side, GLOVE, turned, still)
-    bent = again(side, GLOVE, aligned(side, GLOVE, pose, truth.markers, weight), still)
-    ends = GLOVE.end_markers[0]
-    before, after = (
-        np.linalg.norm((p.markers - truth.markers)[:, ends], axis=-1).mean(0) for p in (stiff, bent)
-    )
-    assert (after < before / 2).all()
-    assert_array_equal(
-        side.skeleton.bend_fingers(GLOVE, *pose[:3], truth.markers, weight)[:, ::3],
-        pose.local[:, ::3],
-    )
-
-
-@given(angles=joint_angles(0.8), other=joint_angles(0.8), motion=motions())
-def test_alignment_turns_with_the_hand_and_is_the_same_on_all_sides(
-    side: Side, angles: Array, other: Array, motion: tuple[Array, Array]
-) -> None:
-    def at(which: Side, motion: tuple[Array, Array]) -> Array:
-        pose = posed(which, GLOVE, angles, motion)
-        measured = posed(which, GLOVE, other, motion).markers
-        return aligned(which, GLOVE, pose, measured, np.ones(len(GLOVE)))
-
-    still = at(side, (EYE, ORIGIN))
-    tolerance = 1e-7 if side.dtype == np.float64 else 1e-3
-    assert_allclose(at(side, motion), still, rtol=0, atol=tolerance)
-    assert_allclose(still, at(REFERENCE, (EYE, ORIGIN)), rtol=0, atol=tolerance)
 
 
 @given(angles=joint_angles(), flat=joint_angles(0.3))

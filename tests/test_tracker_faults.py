@@ -22,8 +22,8 @@ from streams import (
 from numpy_infer import tracker
 from numpy_infer.model import Model
 from numpy_infer.networks import read_spec
+from numpy_infer.pose import HandPose, State, TrackingState
 from numpy_infer.predictors import PREDICTORS
-from numpy_infer.tracker import HandPose, State, TrackingState
 
 Array = np.ndarray
 
@@ -154,7 +154,7 @@ def test_fault_6_no_time_kills_no_offset(predictor: str) -> None:
         before = state
         state, pose = tracker.step(model, state, markers, visible[31], np.zeros(4))
         assert_array_equal(np.linalg.norm(state.correction, axis=-1), correction)
-        steps = np.linalg.norm(pose.markers - before.pose.markers, axis=-1)
+        steps = np.linalg.norm(pose.markers - before.output, axis=-1)
         moves = np.linalg.norm(markers - before.markers, axis=-1)
         # As far as the measurement went, and as far as the correction turned with the hand.
         assert (steps <= moves + 0.3 * correction + 1e-9).all()

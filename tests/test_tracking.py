@@ -41,7 +41,7 @@ def recording_with_gaps() -> Recording:
     return Recording(HAND.markers, markers, TIME, 60.0, "made up")
 
 
-def test_offline_equals_live_bit_for_bit() -> None:
+def test_offline_equals_live() -> None:
     recording = recording_with_gaps()
     tracked = track(recording, Model(HAND))
     tracker = HandTracker(Model(HAND))
@@ -49,7 +49,7 @@ def test_offline_equals_live_bit_for_bit() -> None:
         tracker.step(m, 1 / 60 if i == 0 else recording.time[i] - recording.time[i - 1])
         for i, m in enumerate(recording.markers)
     ]
-    assert (tracked.recording.markers == np.array([pose.markers for pose in live])).all()
+    assert np.abs(tracked.recording.markers - [pose.markers for pose in live]).max() < 1e-9
     assert (tracked.status == np.array([pose.status for pose in live])).all()
 
 

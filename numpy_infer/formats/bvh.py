@@ -12,11 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from numpy_infer.formats.euler import composed
-from numpy_infer.formats.table import TextFile, positive, read_text
+from numpy_infer.formats.table import LARGEST, TextFile, hertz, positive, read_text
 from numpy_infer.formats.units import agreed
 from numpy_infer.recordings import JointTruth, Recording
 
 _AXES = "XYZ"
+
+MOST_JOINTS = 10
+"""Per channel: a file of more stiff joints would take far more memory than its own size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +66,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         names=bvh.names,
         markers=positions * scale,
         time=np.arange(len(positions)) * bvh.frame_time,
-        rate=1.0 / bvh.frame_time,
+        rate=hertz(1.0 / bvh.frame_time, str(path), "Frame Time"),
         source=str(path),
         unit=scale,
         joints=JointTruth(bvh.names, positions * scale, rotations),
@@ -100,7 +103,7 @@ class _Hierarchy:
     """What the HIERARCHY section says; `end` is the index of the line MOTION."""
 
     def __init__(self) -> None:
-        self.names: list[str] = []
+        self.names: dict[str, int] = {}
         self.parents: list[int] = []
         self.offsets: list[list[float]] = []
         self.end_parents: list[int] = []
@@ -123,7 +126,7 @@ def _read_hierarchy(file: TextFile) -> _Hierarchy:
         match words:
             case []:
                 pass
-            case ["ROOT" | "JOINT", _, *_] if _END_SITE not in open_nodes:
+            case ["ROOT" | "JOINT", _, *_] if open_nodes[-1:] != [_END_SITE]:
                 node = _add_joint(file, index, hierarchy, open_nodes)
             case ["End", "Site", *_] if open_nodes and open_nodes[-1] != _END_SITE:
                 node = _END_SITE
@@ -139,6 +142,9 @@ def _read_hierarchy(file: TextFile) -> _Hierarchy:
             case ["MOTION"] if hierarchy.names and not open_nodes:
                 if len(hierarchy.offsets) != len(hierarchy.names):
                     raise file.error(index, "a joint has no OFFSET")
+                joints, moving = len(hierarchy.names), len(hierarchy.channels)
+                if joints > MOST_JOINTS * moving:
+                    raise file.error(index, f"{joints} joints and only {moving} channels")
                 hierarchy.end = index
                 return hierarchy
             case _:
@@ -150,9 +156,9 @@ def _add_joint(file: TextFile, index: int, hierarchy: _Hierarchy, open_nodes: li
     name = file.lines[index].strip().split(None, 1)[1]
     if name in hierarchy.names:
         raise file.error(index, f"duplicate joint {name!r}")
-    hierarchy.names.append(name)
+    hierarchy.names[name] = len(hierarchy.names)
     hierarchy.parents.append(open_nodes[-1] if open_nodes else -1)
-    return len(hierarchy.names) - 1
+    return hierarchy.names[name]
 
 
 def _add_offset(
@@ -162,7 +168,7 @@ def _add_offset(
         offset = [float(value) for value in values]
     except ValueError:
         offset = []
-    if len(offset) != 3 or not np.isfinite(offset).all():
+    if len(offset) != 3 or not (np.abs(offset) < LARGEST).all():
         raise file.error(index, f"OFFSET: expected 3 numbers, found {' '.join(values)!r}")
     if open_nodes[-1] == _END_SITE:
         hierarchy.end_parents.append(open_nodes[-2])

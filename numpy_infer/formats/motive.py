@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from numpy_infer.formats.table import TextFile, hide_gaps, positive, read_text
+from numpy_infer.formats.table import TextFile, hertz, hide_gaps, positive, read_text
 from numpy_infer.formats.units import agreed, metres_per
 from numpy_infer.recordings import Recording
 
@@ -65,7 +65,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
 def _settings(file: TextFile) -> dict[str, str]:
     cells = _row(file, 0)
     settings = dict(zip(cells[::2], cells[1::2], strict=False))
-    if cells[0] != "Format Version" or not settings.get("Length Units"):
+    if cells[:1] != ["Format Version"] or not settings.get("Length Units"):
         raise file.error(
             0, "expected a Motive export with its header: Format Version, ..., Length Units, ..."
         )
@@ -79,7 +79,7 @@ def _settings(file: TextFile) -> dict[str, str]:
 def _rate(file: TextFile, settings: dict[str, str]) -> float:
     for key in ("Export Frame Rate", "Capture Frame Rate"):
         if settings.get(key):
-            return positive(settings[key], file.where(0), key)
+            return hertz(positive(settings[key], file.where(0), key), file.where(0), key)
     raise file.error(0, "the header has no Export Frame Rate")
 
 
@@ -139,4 +139,7 @@ def _left_out(headings: _Headings) -> tuple[str, ...]:
 
 
 def _row(file: TextFile, index: int) -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([file.lines[index]]), [])]
+    try:
+        return [cell.strip() for cell in next(csv.reader([file.lines[index]]), [])]
+    except csv.Error as error:
+        raise file.error(index, f"not CSV: {error}") from None

@@ -21,6 +21,7 @@ import numpy as np
 from numpy_infer.formats.table import (
     TextFile,
     check_writable,
+    hertz,
     hide_gaps,
     number,
     positive,
@@ -44,7 +45,10 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     file.check_time(time, header + 1)
     if "frames" in comments:
         file.check_count("frames", int(positive(*comments["frames"], "frames")), len(table))
-    rate = positive(*comments["rate"], "rate") if "rate" in comments else median_rate(time, path)
+    if "rate" in comments:
+        rate = hertz(positive(*comments["rate"], "rate"), comments["rate"][1], "rate")
+    else:
+        rate = median_rate(time, path)
     markers, _ = hide_gaps(table[:, columns] * scale, zeros=False)
     recording = Recording(
         names=names,
@@ -97,18 +101,19 @@ def _columns(
     """Marker names, the [M, 3] columns of their coordinates, and notes about skipped columns."""
     if cells[0] != "time":
         raise file.error(header, f"expected the first column to be time, found {cells[0]!r}")
+    place = {cell: index for index, cell in enumerate(cells)}
     angles = [cell for cell in cells if cell.endswith(".deg")]
-    coordinates = [cell for cell in cells[1:] if cell not in angles]
+    coordinates = [cell for cell in cells[1:] if not cell.endswith(".deg")]
     names = tuple(dict.fromkeys(cell.rpartition(".")[0] for cell in coordinates))
     for cell in coordinates:
         if not cell.endswith((".x", ".y", ".z")) or len(cell) < 3:
             raise file.error(header, f"unknown column {cell!r}; expected NAME.x, NAME.y, NAME.z")
     for name in names:
         for axis in "xyz":
-            if f"{name}.{axis}" not in cells:
+            if f"{name}.{axis}" not in place:
                 raise file.error(header, f"marker {name!r} has no column {name}.{axis}")
     if not names:
         raise file.error(header, "no marker columns; expected NAME.x, NAME.y, NAME.z")
-    columns = np.array([[cells.index(f"{name}.{axis}") for axis in "xyz"] for name in names])
+    columns = np.array([[place[f"{name}.{axis}"] for axis in "xyz"] for name in names])
     notes = (f"{len(angles)} columns of angles (.deg) are skipped",) if angles else ()
     return names, columns, notes

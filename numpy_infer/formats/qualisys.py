@@ -15,6 +15,7 @@ import numpy as np
 from numpy_infer.formats.table import (
     TextFile,
     check_writable,
+    hertz,
     hide_gaps,
     millimetre_rows,
     number,
@@ -37,7 +38,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     leading, first = _leading_columns(file, first, len(names))
     table = file.numbers(first, len(leading) + 3 * len(names), "\t")
     file.check_count("frames", int(_number(file, header, "NO_OF_FRAMES")), len(table))
-    rate = _number(file, header, "FREQUENCY")
+    rate = hertz(_number(file, header, "FREQUENCY"), file.where(0), "FREQUENCY")
     if "Time" in leading:
         time = table[:, leading.index("Time")]
         file.check_time(time, first)
@@ -129,6 +130,5 @@ def _number(file: TextFile, header: dict[str, tuple[int, list[str]]], key: str) 
 
 
 def _without_trailing(cells: list[str]) -> list[str]:
-    while cells and not cells[-1]:
-        cells = cells[:-1]
-    return cells
+    named = next((i for i in reversed(range(len(cells))) if cells[i]), -1)
+    return cells[: named + 1]

@@ -8,7 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from numpy_infer.formats.refusal import shortened
 from numpy_infer.recordings import Recording
+
+LARGEST = 1e15
+"""A number beyond this, in any unit, is no measurement: made of it, others would overflow."""
+
+RATES = (1e-6, 1e9)
+"""Hz: outside these a number is no frame rate."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +28,7 @@ class TextFile:
 
     def error(self, index: int, message: str) -> ValueError:
         """ValueError at line `index`, counted from 0."""
-        return ValueError(f"{self.where(index)}: {message}")
+        return ValueError(f"{self.where(index)}: {shortened(message)}")
 
     def where(self, index: int) -> str:
         """FILE:LINE of line `index`, counted from 0; past the end, the last line."""
@@ -34,21 +41,28 @@ class TextFile:
         return [cell.strip() for cell in self.lines[index].split(delimiter)]
 
     def numbers(self, first: int, columns: int, delimiter: str | None) -> np.ndarray:
-        """[rows, columns] numbers from line `first` to the end; blank cells are NaN.
+        """[rows, columns] numbers from line `first` to the end; NaN where a cell is blank, or its
+        number beyond measure (`LARGEST`).
 
         Empty cells beyond the last column are forgiven, every other misfit is a ValueError.
         """
-        table = np.empty((max(len(self.lines) - first, 0), columns))
-        if not len(table):
+        lines = self.lines[first:]
+        if not lines:
             raise self.error(first, "the file has a header and no frames")
-        for row, line in enumerate(self.lines[first:]):
+        # A header may promise more than memory holds; a row that has its cells has as many bytes.
+        if sum(map(len, lines)) < len(lines) * (columns - 1):
+            short = next(i for i, line in enumerate(lines) if len(line) < columns - 1)
+            raise self.error(first + short, _misfit(columns, lines[short].split(delimiter)))
+        table = np.empty((len(lines), columns))
+        for row, line in enumerate(lines):
             cells = line.split(delimiter)
             if len(cells) < columns or any(map(str.strip, cells[columns:])):
-                raise self.error(first + row, f"expected {columns} columns, found {len(cells)}")
+                raise self.error(first + row, _misfit(columns, cells))
             try:
                 table[row] = _row_of_numbers(line, cells[:columns])
             except ValueError:
                 raise self.error(first + row, _not_a_number(cells)) from None
+        table[np.abs(table) > LARGEST] = np.nan
         return table
 
     def check_count(self, what: str, stated: int, found: int) -> None:
@@ -62,7 +76,9 @@ class TextFile:
         """ValueError at the first line whose time is missing."""
         finite = np.isfinite(time)
         if not finite.all():
-            raise self.error(first + int(np.argmin(finite)), "the time is missing")
+            raise self.error(
+                first + int(np.argmin(finite)), "the time is missing or beyond measure"
+            )
 
     def unique(self, index: int, names: Sequence[str], what: str) -> tuple[str, ...]:
         """The names as a tuple; ValueError at line `index` for an empty or a repeated one."""
@@ -139,9 +155,20 @@ def positive(text: str, where: str, what: str) -> float:
     return value
 
 
+def hertz(rate: float, where: str, what: str) -> float:
+    """The frame rate; ValueError at `where` (FILE:LINE) for one that no recording has."""
+    if not RATES[0] <= rate <= RATES[1]:
+        raise ValueError(f"{where}: {what}: {rate:.3g} Hz is no frame rate")
+    return rate
+
+
 def number(value: float) -> str:
     """The shortest text that reads back as the same number."""
     return repr(float(value)).removesuffix(".0")
+
+
+def _misfit(columns: int, cells: Sequence[str]) -> str:
+    return f"expected {columns} columns, found {len(cells)}"
 
 
 def _row_of_numbers(line: str, cells: Sequence[str]) -> list[float]:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy_infer.formats.table import (
     TextFile,
     check_writable,
+    hertz,
     hide_gaps,
     millimetre_rows,
     number,
@@ -38,12 +39,15 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     stated = int(positive(settings["NumFrames"], file.where(2), "NumFrames"))
     left_out = _frames_left_out(file, stated, table[:, 0])
     file.check_time(table[:, 1], first)
+    rate = hertz(
+        positive(settings["DataRate"], file.where(2), "DataRate"), file.where(2), "DataRate"
+    )
     markers, notes = hide_gaps(table[:, 2:].reshape(len(table), -1, 3) * scale, zeros=True)
     recording = Recording(
         names=names,
         markers=markers,
         time=table[:, 1],
-        rate=positive(settings["DataRate"], file.where(2), "DataRate"),
+        rate=rate,
         source=str(path),
         unit=scale,
         notes=file.notes + left_out + notes,

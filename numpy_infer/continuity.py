@@ -1,0 +1,398 @@
+"""From one frame to the next: registration, what fills hidden markers, and the blend that lets no
+output jump. Twin of `jaxhand.continuity`.
+
+Continuity is a blend at the output. `raw` is measured where visible and predicted from measured
+markers where hidden; in the registered frame `output = raw + correction`. While the visible set is
+unchanged the correction of a visible marker shrinks at 25 cm/s (paper, section 3.2.2) and that of
+a hidden one fades with posture, `exp(−d/δ)`, d the RMS change of the registered visible markers.
+When the set changes, the previous frame is done again with the new set, and what is missing to the
+previous output becomes the correction; so the output goes on from where it was.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from numpy_infer import gate
+from numpy_infer.arrays import Array
+from numpy_infer.geometry import (
+    fit,
+    kabsch,
+    mean_point,
+    pattern,
+    second_extent,
+    transform,
+    untransform,
+)
+from numpy_infer.model import Model
+from numpy_infer.output import leading, wrist_pose
+from numpy_infer.pose import DETERMINED_EXTENT, State
+from numpy_infer.predictors import PREDICTORS, learned_step, predicted_markers
+
+SHRINK_SPEED = 0.25
+"""m/s at which the correction of a visible marker dies (paper, section 3.2.2)."""
+
+FARTHEST_CORRECTION = 10.0
+"""Metres: an output that is farther off comes of a frame that was no hand's (in millimetres, say),
+and is given up at once rather than for a minute."""
+
+SAME_POSTURE = 1e-4
+"""Metres, RMS: markers that fit this well where they were seen last tell how the hand turned."""
+
+
+def advance(
+    model: Model, state: State, markers: Array, visible: Array, dt: Array, late: Array
+) -> State:
+    """The state after a frame of clean input."""
+    own, accepted = state.gate, visible
+    if model.gate:
+        own, accepted = gate.step(
+            model, state.gate, markers, visible, state.output, state.tracked, dt
+        )
+    rejected = visible & ~accepted
+    if np.count_nonzero(rejected):
+        markers = np.where(accepted[..., None], markers, 0)
+    weight = accepted.astype(markers.dtype)
+    frame = _steady(model, state, markers, accepted, weight, dt)
+    if frame is None:
+        frame = _unsteady(model, state, markers, accepted, weight, dt)
+    new_state = _blended(model, state, frame, markers, accepted, weight, dt)
+    new_state = new_state._replace(gate=own, rejected=rejected)
+    if np.count_nonzero(late):
+        same = (accepted == state.visible).all(-1) & (markers == state.markers).all((-1, -2))
+        new_state = choose(late & state.known.any(-1) & same, state, new_state)
+    return new_state
+
+
+def together(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State | None:
+    """The states, an axis in front or 1 in its place, after each of several frames of one visible
+    set `[T, ..., M]`; None if they are not all steady, or not quiet for the gate. While the set
+    stays, a correction depends on the time since, not on the frames between."""
+    own = gate.quietly(state.gate, markers, visible, dt) if model.gate else state.gate
+    if own is None:
+        return None
+    state = each(lambda leaf: leaf[None], state._replace(gate=own))
+    weight, elapsed = visible.astype(markers.dtype), np.cumsum(dt, 0)
+    frame = _steady(model, state, markers, visible, weight, elapsed)
+    return frame and _blended(model, state, frame, markers, visible, weight, elapsed)
+
+
+def _blended(
+    model: Model,
+    state: State,
+    frame: _Frame,
+    markers: Array,
+    visible: Array,
+    weight: Array,
+    dt: Array,
+) -> State:
+    """The state after a frame: output and wrist, with corrections added."""
+    correction, placed, exact = frame.correction, frame.registered, frame.exact
+    if model.continuity and np.count_nonzero(correction):
+        correction, blend = _blend(model, frame, visible, weight, dt)
+        placed = placed + blend
+        exact = exact & (blend == 0).all(-1)
+    output = frame.raw
+    if not exact.all():
+        moved = transform(frame.rotation, frame.translation, placed)
+        output = np.where(exact[..., None], output, moved)
+    rotation, position = frame.wrist or wrist_pose(model, output, frame.rotation)
+    return State(
+        right=state.right,
+        gate=state.gate,
+        rejected=np.zeros_like(visible),
+        predictor=frame.predictor,
+        output=output,
+        wrist_rotation=rotation,
+        wrist_position=position,
+        markers=markers,
+        visible=visible,
+        tracked=state.tracked | frame.tracking,
+        tracking=frame.tracking,
+        rotation=frame.rotation,
+        translation=frame.translation,
+        seen=np.where(visible[..., None], frame.registered, frame.seen),
+        known=state.known | visible,
+        correction=correction,
+        anchor=frame.anchor,
+        prior=frame.prior,
+        age=np.where(visible, 0, state.age + dt[..., None]),
+    )
+
+
+class _Frame(NamedTuple):
+    """A frame before the blend; what has the name of a field of `State` will be that."""
+
+    predictor: Any
+    tracking: Array
+    rotation: Array
+    translation: Array
+    seen: Array
+    """As carried from the frame before."""
+    correction: Array
+    anchor: Array
+    prior: Array
+    registered: Array
+    """`[..., M, 3]` registered frame: measured where visible, else predicted or held."""
+    raw: Array
+    """`[..., M, 3]` the same in the world, where `exact [..., M]` says that it is known there."""
+    exact: Array
+    wrist: tuple[Array, Array] | None
+    """The wrist's rotation and position, where measured markers give it."""
+
+
+def _steady(
+    model: Model, state: State, markers: Array, visible: Array, weight: Array, dt: Array
+) -> _Frame | None:
+    """The frame if every hand is tracked and sees the markers of the frame before, as in most
+    frames; else None."""
+    hand, tracking = model.hand, state.tracking
+    if np.count_nonzero(visible != state.visible) or np.count_nonzero(tracking) < tracking.size:
+        return None
+    # The registration and, from the same markers, the wrist's pose.
+    weights = np.empty((2, *weight.shape), weight.dtype)
+    weights[0], weights[1] = weight, hand.alignment_weight
+    template = hand.template.astype(markers.dtype, copy=False)
+    if model.wearer is not None:
+        template = np.stack([template, model.wearer.template.astype(markers.dtype)])
+        template = template.reshape(2, *(1,) * (markers.ndim - 2), *hand.template.shape)
+    rotations, translations, second = fit(
+        pattern(template, weights),
+        markers,
+        lambda: np.stack(
+            np.broadcast_arrays(_carried_prior(state, markers, weight), state.rotation)
+        ),
+    )
+    # The markers' own second singular value is at least that over the template's first.
+    if second[0].min() <= DETERMINED_EXTENT * hand.extent:
+        return None
+    registration = rotations[0], translations[0]
+    before = state.rotation, state.translation
+    registered = untransform(*registration, markers)
+    # Not if one of its markers is hidden, or on its way to where it is measured.
+    direct = (
+        np.count_nonzero(visible[..., hand.aligned]) == hand.aligned.size * visible[..., 0].size
+    )
+    if direct and np.count_nonzero(state.correction):
+        direct = not np.count_nonzero(state.correction[..., hand.aligned, :])
+    advance, registered, raw, exact = _fill(
+        model,
+        state.predictor,
+        registered,
+        markers,
+        visible,
+        state.output,
+        dt,
+        registration,
+        before,
+    )
+    return _Frame(
+        advance,
+        tracking,
+        *registration,
+        state.seen,
+        state.correction,
+        state.anchor,
+        state.prior,
+        registered,
+        raw,
+        exact,
+        (rotations[1], translations[1]) if direct else None,
+    )
+
+
+def _unsteady(
+    model: Model, state: State, markers: Array, visible: Array, weight: Array, dt: Array
+) -> _Frame:
+    """Any frame. The one before is done again with this frame's visible set: a marker hidden then
+    takes its position of now, carried back by the hand's motion since."""
+    template = model.hand.template.astype(markers.dtype, copy=False)
+    tracking = second_extent(markers, weight) > DETERMINED_EXTENT
+    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
+    shift = mean_point(markers - state.markers, (visible & state.visible).astype(markers.dtype))
+    known = visible[..., None]
+
+    was_seen = state.visible[..., None]
+    before = transform(state.rotation, state.translation, state.seen)
+    before = np.where(was_seen, state.markers, before)
+    turn, move = _motion(state, before, markers, visible, tracking, shift)
+    returned = np.where(was_seen, state.markers, untransform(turn, move, markers))
+    previous: Array = np.where(known, returned, 0)
+    # The prior is that of now, carried back too: if only the set has changed, so has nothing else.
+    followed = turn.swapaxes(-1, -2) @ state.rotation
+
+    def priors() -> Array:
+        carried = _carried_prior(state, markers, weight)
+        return np.stack([np.where(changed[..., None, None], state.rotation, carried), followed])
+
+    found = fit(pattern(template, weight), np.stack([markers, previous]), priors)
+    start = mean_point(markers, weight) - mean_point(template, weight)
+    start = np.where(visible.any(-1, keepdims=True), start, state.translation)
+    moved = np.where(state.tracked[..., None], state.translation + shift, start)
+    sure, tracked = tracking[..., None, None], state.tracked[..., None, None]
+    rotations = np.where(sure, found[0], state.rotation)
+    translations = np.where(tracking[..., None], found[1], np.stack([moved, state.translation]))
+    now, then = ((rotations[i], translations[i]) for i in (0, 1))
+    # Before there was any output the template stands in for it.
+    placed = transform(*now, template)
+    last = np.where(tracked, state.output, placed)
+
+    measured = untransform(rotations, translations, np.stack([markers, previous]))
+    if PREDICTORS[model.predictor].step is learned_step:
+        # Both frames in one product per layer of the network.
+        advance, both, raw, exact = _fill(
+            model, state.predictor, measured, markers, visible, last, dt, now, now
+        )
+        registered, again = both
+    else:
+        earlier = _registration_before(state, then, changed, now)
+        advance, registered, raw, exact = _fill(
+            model, state.predictor, measured[0], markers, visible, last, dt, now, earlier
+        )
+        still = np.zeros_like(dt)
+        _, again, *_ = _fill(
+            model, state.predictor, measured[1], previous, visible, last, still, then, then
+        )
+    held = np.where(tracked, last + shift[..., None, :], placed)
+    registered = np.where(sure | known, registered, untransform(*now, held))
+    raw = np.where(sure | known, raw, held)
+
+    restart, begin = (changed & state.tracked)[..., None, None], ~tracked
+    correction = np.where(sure | known, untransform(*then, last) - again, 0)
+    length = np.sqrt((correction * correction).sum(-1, keepdims=True))
+    correction = np.where(length < FARTHEST_CORRECTION, correction, 0)
+    correction = np.where(begin, 0, np.where(restart, correction, state.correction))
+    anchor = np.where(begin, registered, np.where(restart, measured[1], state.anchor))
+    seen = untransform(*now, transform(turn, move, before))
+    seen = np.where(restart & sure, seen, state.seen)
+    followed = then[0].swapaxes(-1, -2) @ followed
+    prior = np.where(begin, now[0].swapaxes(-1, -2) @ state.rotation, state.prior)
+    return _Frame(
+        advance,
+        tracking,
+        *now,
+        np.where(begin & ~known, template, seen),
+        correction,
+        anchor,
+        np.where(restart, followed, prior),
+        registered,
+        raw,
+        exact | ~tracking[..., None],
+        None,
+    )
+
+
+def _carried_prior(state: State, markers: Array, weight: Array) -> Array:
+    """`[..., 3, 3]` world_from_template that the registration follows where the template's visible
+    markers are near a line, while the set stays the same. The previous rotation would not do: each
+    frame would give it up a little more, and a hand that stands still would turn."""
+    return kabsch(state.anchor, markers, weight, state.rotation)[0] @ state.prior
+
+
+def _fill(
+    model: Model,
+    predictor: Any,
+    registered: Array,
+    markers: Array,
+    visible: Array,
+    last: Array,
+    dt: Array,
+    registration: tuple[Array, Array],
+    before: tuple[Array, Array],
+) -> tuple[Any, Array, Array, Array]:
+    """One step of the model's predictor; the learned one is spared a second registration.
+
+    What a predictor that goes by the frame has nothing to say of moves with the hand: from the
+    registration `before`, of the previous frame by the same markers, to that of this frame.
+
+    Returns:
+        The predictor's next state, and `registered`, `raw` and `exact` as in `_Frame`.
+    """
+    chosen = PREDICTORS[model.predictor]
+    if chosen.step is learned_step:
+        if not visible.all():
+            predicted = predicted_markers(model, registered, visible)
+            registered = np.where(visible[..., None], registered, predicted)
+        return predictor, registered, markers, visible
+    if chosen.uses_frame:
+        last = transform(*registration, untransform(*before, last))
+    advance, raw = chosen.step(model, predictor, markers, visible, last, dt)
+    return advance, untransform(*registration, raw), raw, np.ones_like(visible)
+
+
+def _registration_before(
+    state: State, then: tuple[Array, Array], changed: Array, now: tuple[Array, Array]
+) -> tuple[Array, Array]:
+    """The previous frame's registration by the markers visible now; this frame's own for a hand
+    that had not been tracked."""
+    earlier = state.rotation, state.translation
+    return choose(state.tracked, choose(changed, then, earlier), now)
+
+
+def _motion(
+    state: State, before: Array, markers: Array, visible: Array, tracking: Array, shift: Array
+) -> tuple[Array, Array]:
+    """The hand's rigid motion since the previous frame, from the markers seen in both.
+
+    What those leave open follows where the visible markers were seen last (`before [..., M, 3]`,
+    carried along with the hand since), if the hand had been lost or if they fit without a change of
+    posture; a posture that has changed says nothing of a rotation, so otherwise there is none.
+    """
+    dtype = markers.dtype
+    both = (visible & state.visible).astype(dtype)
+
+    def believed() -> tuple[Array, Array]:
+        eye = np.broadcast_to(np.eye(3, dtype=dtype), state.rotation.shape)
+        earlier = (visible & state.known).astype(dtype)
+        turn, move = kabsch(before, markers, earlier, eye)
+        misfit = mean_point((transform(turn, move, before) - markers) ** 2, earlier).sum(-1)
+        still = ~state.tracking | (misfit < SAME_POSTURE**2)
+        believe = tracking & still & (earlier > 0).any(-1)
+        turn = np.where(believe[..., None, None], turn, eye)
+        return turn, np.where(believe[..., None], move, shift)
+
+    decide = tracking & (both > 0).any(-1)
+    if decide.all():
+        return kabsch(before, markers, both, lambda: believed()[0])
+    turn, move = believed()
+    seen_turn, seen_move = kabsch(before, markers, both, turn)
+    return (
+        np.where(decide[..., None, None], seen_turn, turn),
+        np.where(decide[..., None], seen_move, move),
+    )
+
+
+def _blend(
+    model: Model, frame: _Frame, visible: Array, weight: Array, dt: Array
+) -> tuple[Array, Array]:
+    """The corrections to keep, and those to add now; `[..., M, 3]`, registered frame."""
+    correction, known = frame.correction, visible[..., None]
+    if np.count_nonzero(correction * weight[..., None]):
+        length = np.sqrt((correction * correction).sum(-1))
+        left = np.maximum(length - SHRINK_SPEED * dt[..., None], 0)
+        share = np.where(visible & (length > 0), left / np.where(length > 0, length, 1), 1)
+        correction = correction * share[..., None]
+    difference = (frame.registered - frame.anchor) * weight[..., None]
+    square = (difference * difference).sum((-1, -2)) / np.maximum(weight.sum(-1), 1)
+    fade = np.where(frame.tracking, np.exp(-np.sqrt(square) / model.fade), 0)
+    return correction, np.where(known, correction, correction * fade[..., None, None])
+
+
+def choose(condition: Array, yes: Any, no: Any) -> Any:
+    """`where` over equal trees; `condition [...]` is broadcast from the left."""
+    if isinstance(yes, tuple):
+        parts = [choose(condition, a, b) for a, b in zip(yes, no, strict=True)]
+        return tuple(parts) if type(yes) is tuple else type(yes)(*parts)
+    if yes is None:
+        return None
+    return np.where(leading(condition, yes), yes, no)
+
+
+def each(function: Any, tree: Any) -> Any:
+    """The function on all arrays of nested tuples."""
+    if isinstance(tree, tuple):
+        parts = [each(function, part) for part in tree]
+        return tuple(parts) if type(tree) is tuple else type(tree)(*parts)
+    return function(tree)

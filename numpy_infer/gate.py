@@ -1,0 +1,425 @@
+"""Notices wrong measurements, which are then treated as hidden. Twin of `jaxhand.gate`.
+
+A marker that jumped to a reflection, neighbours that carry each other's label, a marker that stays
+in place while the hand goes on: `step` says which of the visible markers to accept. All tests are
+about the markers among each other, so a rigid motion of the whole stream changes nothing:
+
+- *motion*: where a marker was and its velocity, moved as the hand moves since, tell where it is
+  to be expected; one not accepted before is expected where the tracker put it;
+- *labels*: two neighbours that are both off, and each where the other is expected, are swapped;
+- *freezing*: a coordinate-exact repetition while what carries the marker moved;
+- *geometry*: no two markers are farther apart, or nearer, than a hand can bring them.
+
+What is refused is expected again with a tolerance that grows, so that no marker but a frozen one is
+refused for longer than `LONGEST` seconds; what comes back that way is in doubt, and may leap, for
+as long as it had been refused. Where most of a frame would be refused the gate gives way.
+
+Most frames are quiet: no marker leaves its uniform motion, compared with the others, by `QUIET`
+metres. They are accepted without any of these tests.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from numpy_infer.arrays import Array
+from numpy_infer.geometry import kabsch, mean_point, second_extent, transform
+from numpy_infer.hand import ANGLES, JOINTS, PARENTS, Hand
+from numpy_infer.model import Model
+from numpy_infer.pose import DETERMINED_EXTENT
+from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
+
+QUIET = 5e-3
+"""Metres that a marker of a quiet frame is off its uniform motion at most."""
+
+FRAME = 1 / 60
+"""Seconds: tolerances hold for frames up to this long, and grow in proportion beyond."""
+
+FRESH = 12e-3
+"""Metres that a marker accepted in the previous frame may be off what is expected of it, at least.
+Of recorded ones and simulated ones, one in 100,000 is."""
+RESTLESS = 8.0
+"""The same as a multiple of `GateState.restless`, where that is more."""
+CALM_SECONDS = 0.5
+"""Time in which that fades to half."""
+
+RETURN, GROWTH = 25e-3, 50e-3
+"""Metres, and metres a second since it was accepted last: how far a marker that was hidden or
+refused may be off when it is accepted."""
+HIDDEN = 3.0
+"""How many times farther one may be that was hidden: nothing yet speaks against it."""
+ONWARD = 0.25
+"""A marker refused for a step that goes on in the same direction, by this part of it, is right."""
+LONGEST = 2.0
+"""Seconds after which a marker is accepted wherever it is."""
+
+SWAP_FIT = 8e-3
+"""Metres that neighbours with each other's labels are off at most."""
+SWAP_LEAST, SWAP_OFF = 6e-3, 3.0
+"""Metres, and how many times farther, both together are off with their own at least."""
+
+MOVED = 0.2e-3
+"""Metres: what moves by more in a frame does move."""
+
+ROBUST_SCALE, ROBUST_ROUNDS = 8e-3, 3
+"""Metres at which a marker loses three quarters of its say in the hand's motion (Geman, McClure
+1987), and rounds of reweighting."""
+VOTES = 4
+"""To which power goes the part of the markers that keep their distance from one."""
+
+POSTURES = 2000
+"""Postures out of which `reach` takes distances."""
+NEARER, FARTHER, SLACK = 0.75, 1.25, 0.01
+"""Factors, and metres, by which other people's distances and other gloves' may differ."""
+
+BRIEFEST = 1e-4
+"""Seconds: a shorter frame tells no velocity."""
+
+
+class GateState(NamedTuple):
+    """What the gate carries from frame to frame. Everything in it is a left hand's."""
+
+    markers: Array
+    """`[..., M, 3]` the previous measurements; 0 where hidden."""
+    visible: Array
+    """`[..., M]` True where the previous frame was measured."""
+    accepted: Array
+    """`[..., M]` True where it was accepted."""
+    place: Array
+    """`[..., M, 3]` metres, world: where each marker that is followed was; else 0."""
+    velocity: Array
+    """`[..., M, 3]` m/s of it; else 0."""
+    followed: Array
+    """`[..., M]` True where accepted, or refused because its neighbour carried its label."""
+    calm: Array
+    """`[...]` True where no marker was refused, and none is in doubt."""
+    age: Array
+    """`[..., M]` seconds since the marker was accepted, or since the beginning."""
+    refused: Array
+    """`[..., M]` seconds for which it was measured in vain since then; of an accepted marker, for
+    which it is still in doubt."""
+    leap: Array
+    """`[..., M, 3]` metres, world: the step, beside the hand's, with which a marker left where it
+    was followed in the previous frame; else 0."""
+    restless: Array
+    """`[...]` metres: how far markers of late were off what was expected of them."""
+
+
+class Reach(NamedTuple):
+    """What a hand can do, as tables."""
+
+    nearest: Array
+    """`[M, M]` metres: the least distance of two markers."""
+    farthest: Array
+    """`[M, M]` metres: the largest."""
+    carriers: Array
+    """`[M, M]` True where the second marker is on what carries the first: the same link, or one
+    between it and the wrist; False for a marker itself."""
+    neighbours: Array
+    """`[P, 2]` markers that may be taken for each other: the outermost ones of fingers side by
+    side."""
+    partner: Array
+    """`[P, M]` each marker's own index, the other's for the two of a pair."""
+
+
+@lru_cache(maxsize=16)
+def reach(hand: Hand) -> Reach:
+    """The tables of a hand, from random postures within the ranges of its joints."""
+    low, high = np.radians([angle.range_deg for angle in ANGLES]).T
+    angles = np.random.default_rng(0).uniform(low, high, (POSTURES, len(ANGLES)))
+    eye = np.broadcast_to(np.eye(3), (POSTURES, 3, 3))
+    local = rotations_from_angles(angles)
+    placed = forward_kinematics(hand.skeleton, local, eye, np.zeros((POSTURES, 3)))
+    points = marker_positions(hand, *placed)
+    apart = _distances(points)
+    chains = [_chain(link) for link in hand.links]
+    carriers = np.array([[link in chain for link in hand.links] for chain in chains])
+    ends = np.stack([hand.end_markers[0][:-1], hand.end_markers[0][1:]], -1)
+    pairs = ends[(ends >= 0).all(-1)]
+    partner = np.tile(np.arange(len(hand)), (len(pairs), 1))
+    for own, (one, other) in zip(partner, pairs, strict=True):
+        own[[one, other]] = other, one
+    return Reach(
+        nearest=np.maximum(NEARER * apart.min(0) - SLACK, 0),
+        farthest=FARTHER * apart.max(0) + SLACK,
+        carriers=carriers & ~np.eye(len(hand), dtype=bool),
+        neighbours=pairs,
+        partner=partner,
+    )
+
+
+def _chain(link: int) -> list[int]:
+    """The joints from a link to the wrist, both included."""
+    chain = [link]
+    while PARENTS[chain[-1]] >= 0:
+        chain.append(PARENTS[chain[-1]])
+    return [joint for joint in chain if joint < len(JOINTS)]
+
+
+def init(model: Model, batch: tuple[int, ...] = ()) -> GateState:
+    """A gate that has seen nothing.
+
+    Args:
+        model: its hand is what is known of distances.
+        batch: leading shape of everything.
+    """
+    shape, dtype = (*batch, len(model.hand)), model.hand.template.dtype
+    never, nowhere = np.zeros(shape, bool), np.zeros((*shape, 3), dtype)
+    return GateState(
+        markers=nowhere,
+        visible=never,
+        accepted=never,
+        place=nowhere,
+        velocity=nowhere,
+        followed=never,
+        calm=np.zeros(batch, bool),
+        age=np.zeros(shape, dtype),
+        refused=np.zeros(shape, dtype),
+        leap=nowhere,
+        restless=np.zeros(batch, dtype),
+    )
+
+
+def step(
+    model: Model,
+    state: GateState,
+    markers: Array,
+    visible: Array,
+    last: Array,
+    tracked: Array,
+    dt: Array,
+) -> tuple[GateState, Array]:
+    """Takes in one frame and says what of it to believe.
+
+    Args:
+        model: its hand is what is known of distances.
+        state: from `init` or the previous `step`.
+        markers: `[..., M, 3]` metres, world, of a left hand; 0 where hidden.
+        visible: `[..., M]` True where measured.
+        last: `[..., M, 3]` metres, world: the tracker's previous output.
+        tracked: `[...]` True once the hand has been tracked, so that `last` means something.
+        dt: `[...]` seconds since the previous frame, not negative. At 0 nothing that runs on time
+            moves, and the same markers again change nothing.
+
+    Returns:
+        The new state; `[..., M]` True where visible and accepted.
+    """
+    moved = markers - state.markers
+    far = _off(moved, state.velocity, dt)
+    # A coordinate that is the same again may be a frozen one.
+    told = np.count_nonzero(moved) == 3 * np.count_nonzero(visible)
+    alike = state.calm.all() and (visible == state.visible).all()
+    if told and alike and far.max() < QUIET**2 and dt.min() > BRIEFEST:
+        return _quietly(state, markers, moved, visible, dt), visible
+    told = (moved != 0).sum((-1, -2)) == 3 * visible.sum(-1)
+    alike = state.calm & (visible == state.visible).all(-1)
+    quiet = told & alike & (far.max(-1) < QUIET**2) & (dt > BRIEFEST)
+    repeated = ~(dt > 0) & (visible == state.visible).all(-1) & (moved == 0).all((-1, -2))
+    careful = _carefully(model, state, markers, visible, last, tracked, dt)
+    quick = _quietly(state, markers, moved, visible, np.maximum(dt, BRIEFEST))
+    merged = GateState(
+        *(
+            np.where(_leading(quiet, new), new, np.where(_leading(repeated, old), old, other))
+            for old, new, other in zip(state, quick, careful, strict=True)
+        )
+    )
+    return merged, merged.accepted
+
+
+def quietly(state: GateState, markers: Array, visible: Array, dt: Array) -> GateState | None:
+    """The state after several frames `[T, ..., M, 3]`, all of them accepted, if they are all quiet;
+    else None. Arguments as of `step`, with T in front."""
+    if not (state.calm.all() and (visible == state.visible).all() and dt.min() > BRIEFEST):
+        return None
+    moved = np.diff(markers, axis=0, prepend=state.markers[None])
+    velocity = np.concatenate([state.velocity[None], moved[:-1] / dt[:-1, ..., None, None]])
+    far = _off(moved, velocity, dt)
+    told = np.count_nonzero(moved) == 3 * np.count_nonzero(visible)
+    if not told or far.max() >= QUIET**2:
+        return None
+    last = _quietly(state, markers[-1], moved[-1], visible[-1], dt[-1])
+    fade = np.prod(1 + dt / CALM_SECONDS, 0)
+    age = np.where(visible[-1], 0, state.age + dt.sum(0)[..., None])
+    return last._replace(restless=state.restless / fade, age=age)
+
+
+def _off(moved: Array, velocity: Array, dt: Array) -> Array:
+    """`[..., M]` m²: the square of how far markers left their uniform motion, beside the others."""
+    off = moved - velocity * dt[..., None, None]
+    off = off - off.sum(-2, keepdims=True) / moved.shape[-2]
+    return (off * off).sum(-1)
+
+
+def _quietly(
+    state: GateState, markers: Array, moved: Array, visible: Array, dt: Array
+) -> GateState:
+    """The state after a frame that is like the one before: nothing is off, comes or goes."""
+    time = dt[..., None]
+    return state._replace(
+        markers=markers,
+        place=markers,
+        velocity=moved / time[..., None],
+        age=np.where(visible, 0, state.age + time),
+        restless=state.restless / (1 + dt / CALM_SECONDS),
+    )
+
+
+def _carefully(
+    model: Model,
+    state: GateState,
+    markers: Array,
+    visible: Array,
+    last: Array,
+    tracked: Array,
+    dt: Array,
+) -> GateState:
+    """The state after any other frame."""
+    time, known = dt[..., None], reach(model.hand)
+    # Of what was accepted in spite of what was expected, nothing is expected for as long again.
+    excused = (state.refused >= LONGEST) | (state.accepted & (state.refused > 0))
+    follows = state.followed[..., None]
+    drift = mean_point(state.velocity, state.followed.astype(markers.dtype))[..., None, :]
+    stay = np.where(follows, state.place, last)
+    ahead = np.minimum(time, CALM_SECONDS)[..., None]
+    going = stay + np.where(follows, state.velocity, drift) * ahead
+    fresh = visible & state.followed
+    motion = _motion(np.stack([stay, going]), markers, fresh)
+    placed = transform(*motion, np.stack([stay, going]))
+    off = _least(placed - markers)
+    restless = RESTLESS * state.restless[..., None]
+    usual = np.maximum(FRESH * np.maximum(time / FRAME, 1), restless)
+    trust = np.where(state.refused > 0, 1, HIDDEN)
+    returning = np.maximum(trust * (RETURN + GROWTH * state.age), restless)
+    tolerance = np.where(state.followed, usual, returning)
+    # Fewer than three that are followed do not say where to expect the others.
+    refers = (state.followed | tracked[..., None]) & (fresh.sum(-1) >= 3)[..., None] & ~excused
+    suspect = visible & refers & (off > tolerance)
+    # What jumped stays where it jumped to; a finger that was faster than expected goes on.
+    leapt = (state.leap * state.leap).sum(-1)
+    before = transform(motion[0][0], motion[1][0], state.markers)
+    onward = ((markers - before) * state.leap).sum(-1) > ONWARD * leapt
+    suspect = suspect & ~(onward & (leapt > 0))
+
+    order = _labels(known, placed, markers, off, fresh & refers)
+    swapped = order != np.arange(markers.shape[-2])
+    frozen, same = _frozen(known, state, markers, visible)
+    wrong = suspect | swapped | frozen | (same & ~state.accepted & ~excused)
+    entering = visible & ~state.followed & ~excused
+    wrong = wrong | (entering & _impossible(known, markers, visible & ~wrong))
+
+    # Where most of a frame is wrong, or what is left would not do, it is the gate that is wrong.
+    left = visible & ~wrong
+    enough = _spread(markers, left) | ~_spread(markers, visible)
+    believed = (2 * left.sum(-1) >= visible.sum(-1)) & enough
+    wrong = wrong & believed[..., None]
+    swapped = swapped & believed[..., None]
+    accepted = visible & ~wrong
+    followed = accepted | swapped
+    own = np.take_along_axis(markers, order[..., None], -2)
+    place = np.where(swapped[..., None], own, np.where(accepted[..., None], markers, 0))
+
+    steadily = followed & state.followed & (swapped | ~suspect)
+    brief = (time <= BRIEFEST)[..., None]
+    speed = (place - state.place) / np.maximum(time, BRIEFEST)[..., None]
+    speed = np.where(brief, state.velocity, speed)
+    drift = mean_point(speed, steadily.astype(markers.dtype))[..., None, :]
+    velocity = np.where(steadily[..., None], speed, np.where(followed[..., None], drift, 0))
+    level = mean_point(off[..., None], (accepted & steadily).astype(markers.dtype))[..., 0]
+    agrees = ~state.accepted & (off <= RETURN) & refers
+    forgiven = np.where(agrees, 0, state.refused - np.where(state.accepted, time, 0))
+    refused = np.where(accepted, forgiven, state.refused + np.where(visible & ~frozen, time, 0))
+    refused = np.maximum(refused, 0)
+    return GateState(
+        markers=markers,
+        visible=visible,
+        accepted=accepted,
+        place=place,
+        velocity=velocity,
+        followed=followed,
+        calm=~(wrong | (refused > 0)).any(-1),
+        age=np.where(accepted, 0, state.age + time),
+        refused=refused,
+        leap=np.where((suspect & wrong & state.followed)[..., None], markers - placed[0], 0),
+        restless=np.maximum(state.restless / (1 + dt / CALM_SECONDS), level),
+    )
+
+
+def _motion(places: Array, markers: Array, fresh: Array) -> tuple[Array, Array]:
+    """The rigid motion `[..., 3, 3]`, `[..., 3]` of the hand from `places` to `markers`, by those
+    that are `fresh`, except what does not fit."""
+    eye = np.broadcast_to(np.eye(3, dtype=markers.dtype), (*places.shape[:-2], 3, 3))
+    markers = np.broadcast_to(markers, places.shape)
+    use = np.broadcast_to(fresh.astype(markers.dtype), places.shape[:-1])
+    # A marker's first say is by how many keep their distance from it: large errors would turn the
+    # hand of a plain fit.
+    both = use[..., :, None] * use[..., None, :]
+    earlier, now = _distances(places) * both, _distances(markers) * both
+    change = earlier - now
+    votes = (use[..., None, :] / (1 + np.minimum(change * change, 1) / ROBUST_SCALE**2)).sum(-1)
+    # Sizes that are no hand's would overflow in float32.
+    size = np.maximum(earlier, now).max((-1, -2))
+    use = use / (1 + size * size)[..., None]
+    motion = kabsch(places, markers, use * (votes / markers.shape[-2]) ** VOTES, eye)
+    for _ in range(ROBUST_ROUNDS):
+        off = transform(*motion, places) - markers
+        far = np.minimum((off * off).sum(-1), 1) / ROBUST_SCALE**2
+        motion = kabsch(places, markers, use / (1 + far) ** 2, eye)
+    return motion
+
+
+def _distances(points: Array) -> Array:
+    """`[..., M, M]` metres, of all to all."""
+    apart = points[..., :, None, :] - points[..., None, :, :]
+    return np.sqrt((apart * apart).sum(-1))
+
+
+def _least(off: Array) -> Array:
+    """`[2, ..., 3]` → `[...]` the lesser length."""
+    return np.sqrt((off * off).sum(-1).min(0))
+
+
+def _labels(known: Reach, placed: Array, markers: Array, off: Array, fresh: Array) -> Array:
+    """`[..., M]` the label under which each marker is measured: its own, or a neighbour's."""
+    order = np.broadcast_to(np.arange(markers.shape[-2]), fresh.shape)
+    for (one, other), partner in zip(known.neighbours, known.partner, strict=True):
+        crossed = _least(placed[..., one, :] - markers[..., other, :])
+        crossed_back = _least(placed[..., other, :] - markers[..., one, :])
+        fits = np.maximum(crossed, crossed_back) < SWAP_FIT
+        better = off[..., one] + off[..., other] > SWAP_LEAST + SWAP_OFF * (crossed + crossed_back)
+        swap = fresh[..., one] & fresh[..., other] & fits & better
+        order = np.where(swap[..., None], partner, order)
+    return order
+
+
+def _frozen(known: Reach, state: GateState, markers: Array, visible: Array) -> tuple[Array, Array]:
+    """`[..., M]` each: True where a marker is at the same place again although two of those on what
+    carries it have moved; True where it is at the same place again."""
+    again = visible & state.visible
+    moved = markers - state.markers
+    same = again & (moved == 0).all(-1)
+    moving = again & ((moved * moved).sum(-1) > MOVED**2)
+    return same & ((known.carriers & moving[..., None, :]).sum(-1) >= 2), same
+
+
+def _impossible(known: Reach, markers: Array, candidates: Array) -> Array:
+    """`[..., M]` True where a marker is too far from or too near to most of the other candidates
+    for a hand."""
+    apart = _distances(markers)
+    far = apart > known.farthest.astype(markers.dtype)
+    near = apart < known.nearest.astype(markers.dtype)
+    pair = candidates[..., :, None] & candidates[..., None, :]
+    count = (pair & (far | near)).sum(-1)
+    return candidates & (2 * count > candidates.sum(-1)[..., None] - 1)
+
+
+def _spread(markers: Array, weight: Array) -> Array:
+    """`[...]` True where the markers determine the hand's pose."""
+    return second_extent(markers, weight.astype(markers.dtype)) > DETERMINED_EXTENT
+
+
+def _leading(condition: Array, values: Array) -> Array:
+    """`condition [...]` with axes of 1 behind, to go with `values [..., …]`."""
+    return condition.reshape(condition.shape + (1,) * (values.ndim - condition.ndim))
