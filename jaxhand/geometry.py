@@ -226,17 +226,35 @@ def shortest_arc(source: Array, target: Array, share: Array | None = None) -> Ar
 
     Vectors `[..., 3]` without length turn nothing. Between opposite ones every half turn is least:
     the one about the coordinate axis farthest from them, made perpendicular, is taken.
+
+    Made of two reflections, across the source and across the direction half way to where it goes:
+    no angle has to be known for it.
     """
-    crossed = cross(source, target)
-    sine = jnp.sqrt((crossed * crossed).sum(-1))
-    cosine = (source * target).sum(-1)
+    source, target = _direction(source), _direction(target)
+    cosine = (source * target).sum(-1)[..., None]
+    aside = target - cosine * source
     farthest = jnp.eye(3, dtype=source.dtype)[jnp.argmin(jnp.abs(source), -1)]
-    aside = cross(source, farthest)
-    opposite = (sine <= 1e-6 * jnp.abs(cosine)) & (cosine < 0)
-    axis = jnp.where(opposite[..., None], aside, crossed)
-    length = jnp.sqrt((axis * axis).sum(-1))
-    angle = jnp.arctan2(sine, cosine) * (1 if share is None else share)
-    return rotation_from_vector(axis * (angle / jnp.where(length > 0, length, 1))[..., None])
+    across = farthest - (farthest * source).sum(-1)[..., None] * source
+    sine = jnp.sqrt((aside * aside).sum(-1))[..., None]
+    opposite = (sine <= 1e-6) & (cosine < 0)
+    if share is None:
+        half_way = jnp.where(opposite, across, source + target)
+    else:
+        angle = share[..., None] * jnp.arctan2(sine, cosine) / 2
+        aside = _direction(jnp.where(opposite, across, aside))
+        half_way = jnp.cos(angle) * source + jnp.sin(angle) * aside
+    length = (source * source).sum(-1)[..., None] * (target * target).sum(-1)[..., None]
+    half_way = _direction(half_way)
+    there = 2 * (half_way * source).sum(-1)[..., None] * half_way - source
+    half_way, there = (jnp.where(length > 0, part, source) for part in (half_way, there))
+    turned = there[..., None] * source[..., None, :] - half_way[..., None] * half_way[..., None, :]
+    return jnp.eye(3, dtype=source.dtype) + 2 * turned
+
+
+def _direction(vector: Array) -> Array:
+    """`[..., 3]` with length 1; what has no length stays without."""
+    length = jnp.sqrt((vector * vector).sum(-1))[..., None]
+    return vector / jnp.where(length > 0, length, 1)
 
 
 def quaternion(rotation: Array) -> Array:

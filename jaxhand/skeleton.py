@@ -5,21 +5,25 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhand.geometry import apart, cross, product, shortest_arc, transform
+from jaxhand.geometry import apart, product, shortest_arc, transform
 from numpy_infer.arrays import Array
 from numpy_infer.hand import CHAINS, JOINTS, Hand
 from numpy_infer.skeleton import (
     BASE_ANGLES,
+    BASE_FORM,
     BEND_NOISE,
     BEND_PRIOR,
     CROSS,
     CROSS_SQUARED,
     EULER,
     FARTHEST_BEND,
+    FINGER_ANGLES,
     FLEXIONS,
     JOINT_AXES,
+    OUTER_ANGLES,
     SIGNS,
     SLOTS,
+    finger_forms,
 )
 
 
@@ -180,14 +184,44 @@ def place_fingers(
         angles `[..., 26]` as they now are; positions `[..., 21, 3]` metres and rotations
         `[..., 16, 3, 3]`, hand frame.
     """
-    skeleton = jnp.asarray(hand.skeleton, angles.dtype)
-    positions, rotations = forward_kinematics(skeleton, rotations_from_angles(angles))
+    batch, dtype = angles.shape[:-1], angles.dtype
+    ends, has = hand.end_markers
+    base = jnp.asarray(hand.skeleton, dtype)[1:16:3]
+    waves = _waves(angles[..., FINGER_ANGLES])
+    products = _products(*(waves[..., i, :] for i in range(3)))
+    turn = _form(products[..., 0, :], BASE_FORM).reshape(*batch, 5, 3, 3)
+    own = _form(products[..., 1, :], finger_forms(hand, jnp).beyond).reshape(*batch, 5, 3, 10)
     if markers is not None:
-        positions, rotations = align_fingers(hand, positions, rotations, markers)
-        base = _euler(rotations[..., 1::3, :, :], JOINT_AXES[::3])
-        signs = jnp.asarray(SIGNS[BASE_ANGLES]).astype(angles.dtype)
-        angles = angles.at[..., BASE_ANGLES].set(base * signs)
-    return angles, positions, rotations
+        modelled = product(turn, own[..., 9:])[..., 0]
+        measured = jnp.where(has[:, None] > 0, markers[..., ends, :] - base, modelled)
+        turn = apart(product(apart(shortest_arc(modelled, measured)), turn))
+        signs = jnp.asarray(SIGNS[BASE_ANGLES]).astype(dtype)
+        angles = angles.at[..., BASE_ANGLES].set(_euler(turn, JOINT_AXES[::3]) * signs)
+    placed = apart(product(turn, own[..., :9]))
+    points = jnp.swapaxes(placed[..., :3], -1, -2) + base[:, None, :]
+    joints = jnp.concatenate([jnp.broadcast_to(base, (*batch, 5, 3))[..., None, :], points], -2)
+    wrist = jnp.zeros((*batch, 1, 3), dtype)
+    inner = joints[..., :3, :].reshape(*batch, 15, 3)
+    positions = jnp.concatenate([wrist, inner, joints[..., 3, :]], -2)
+    turns = jnp.stack([turn, placed[..., 3:6], placed[..., 6:]], -3).reshape(*batch, 15, 3, 3)
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*batch, 1, 3, 3))
+    return angles, positions, jnp.concatenate([eye, turns], -3)
+
+
+def _waves(angles: Array) -> Array:
+    """`[..., 3]` 1, cosine and sine of `[...]`."""
+    return jnp.stack([jnp.ones_like(angles), jnp.cos(angles), jnp.sin(angles)], -1)
+
+
+def _products(first: Array, second: Array, third: Array) -> Array:
+    """`[..., 27]` products of three `[..., 3]`, the last one's running fastest."""
+    three = first[..., :, None, None] * second[..., None, :, None] * third[..., None, None, :]
+    return three.reshape(*three.shape[:-3], 27)
+
+
+def _form(products: Array, form: Array) -> Array:
+    """`[..., 5, K]` products by each finger's `[5, K, out]` form."""
+    return jnp.einsum("...fp,fpo->...fo", products, jnp.asarray(form, products.dtype))
 
 
 def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
@@ -208,34 +242,20 @@ def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
     """
     ends, has = hand.end_markers
     dtype = angles.dtype
-    local = rotations_from_angles(angles)
-    arms = end_arms(hand).astype(dtype)
-    middle, last = local[..., 1::3, :, :], local[..., 2::3, :, :]
-    outer = product(last, arms[:, 2, :, None])[..., 0]
-    inner = product(middle, (arms[:, 1] + outer)[..., None])[..., 0]
-    way = arms[:, 0] + inner
-    reach = jnp.sqrt((way * way).sum(-1))
-    direction = way / jnp.where(reach > 0, reach, 1)[..., None]
-    signed = SIGNS[FLEXIONS][..., None] * JOINT_AXES.reshape(5, 3, 3, 3)[:, 1:, :, 0]
-    axes = jnp.asarray(signed).astype(dtype)
-    by_last = product(middle, cross(axes[:, 1], outer)[..., None])[..., 0]
-    slopes = jnp.stack([cross(axes[:, 0], inner), by_last], -2)
-    slopes = (slopes * direction[..., None, :]).sum(-1)
+    value = _waves(angles[..., OUTER_ANGLES])
+    zero = jnp.zeros_like(value[..., 0])
+    slope = jnp.stack([zero, -value[..., 2], value[..., 1]], -1)
+    square = finger_forms(hand, jnp).square.reshape(5, 27, 1)
+
+    def of(first: Array, last: Array) -> Array:
+        products = _products(first[..., 0, :], value[..., 1, :], last[..., 2, :])
+        return _form(products, square)[..., 0]
+
+    reach = jnp.sqrt(jnp.maximum(of(value, value), 0))
+    slopes = jnp.stack([of(slope, value), of(value, slope)], -1)
+    slopes = slopes / (2 * jnp.where(reach > 0, reach, 1))[..., None]
     target = markers[..., ends, :] - jnp.asarray(hand.skeleton, dtype)[1:16:3]
     short = has.astype(dtype) * (jnp.sqrt((target * target).sum(-1)) - reach)
     damped = (slopes * slopes).sum(-1) + (BEND_NOISE / BEND_PRIOR) ** 2
     bend = jnp.clip(slopes * (short / damped)[..., None], -FARTHEST_BEND, FARTHEST_BEND)
     return angles.at[..., FLEXIONS].add(bend)
-
-
-def end_arms(hand: Hand) -> Array:
-    """`[5, 3, 3]` metres: the way from each finger's base to its outermost marker, in the three
-    parts that its joints carry, from the base out; 0 where it has none."""
-    ends, has = hand.end_markers
-    joints, links = (places[ends, None] for places in hand.placing)
-    level = np.arange(3)
-    between = (np.array(CHAINS) == joints).argmax(-1)[:, None] > level
-    skeleton, offsets = jnp.asarray(hand.skeleton), jnp.asarray(hand.offsets)
-    bones = jnp.where(between[..., None], skeleton[np.array(CHAINS)[:, 1:]], 0)
-    own = jnp.where(((links - 1) % 3 == level)[..., None], offsets[ends, None], 0)
-    return jnp.where(has[:, None, None] > 0, bones + own, 0)

@@ -244,10 +244,11 @@ def _reflected(source: Array, target: Array, share: Array) -> tuple[Array, Array
     farthest = _EYE.astype(source.dtype)[np.argmin(np.abs(source), -1)]
     across = farthest - _dot(farthest, source) * source
     aside = np.where((sine <= 1e-6) & (cosine < 0), across, aside)
-    angle = np.where(has_arc, share[..., None] * np.arctan2(sine, cosine) / 2, 0)
+    angle = share[..., None] * np.arctan2(sine, cosine) / 2
     # Once more: of nearly opposite ones `aside` is not quite perpendicular.
     half_way = _direction(np.cos(angle) * source + np.sin(angle) * _direction(aside))
-    return source, half_way, 2 * _dot(half_way, source) * half_way - source
+    there = 2 * _dot(half_way, source) * half_way - source
+    return source, *(np.where(has_arc, part, source) for part in (half_way, there))
 
 
 def _direction(vector: Array) -> Array:

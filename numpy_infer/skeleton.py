@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -200,19 +200,22 @@ def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
     Returns:
         `[..., 26]` radians.
     """
+    ends, has = hand.end_markers
     forms, dtype = _forms(hand), angles.dtype
-    waves = np.cos(angles[..., OUTER_ANGLES, None, None] * _WAVE_RATES + _WAVE_PHASES)
-    waves = waves.astype(dtype, copy=False)
+    value = _waves(angles[..., OUTER_ANGLES])
+    waves = np.zeros((*value.shape[:-1], 2, 3), dtype)
+    waves[..., 0, :] = value
+    waves[..., 1, 1], waves[..., 1, 2] = -value[..., 2], value[..., 1]
     # Value and slope by the middle joint, times the abduction's value; then by the last joint.
-    first = waves[..., 0, :, :, None] * waves[..., 1, :1, None, :]
+    first = waves[..., 0, :, :, None] * value[..., 1, None, None, :]
     form = first.reshape(*first.shape[:-2], 9) @ forms.square.astype(dtype, copy=False)
     form = form @ waves[..., 2, :, :].swapaxes(-1, -2)
     reach = np.sqrt(np.maximum(form[..., :1, 0], 0))
     slopes = form.reshape(*form.shape[:-2], 4)[..., 2:0:-1] / (2 * np.where(reach > 0, reach, 1))
-    target = markers[..., forms.ends, :] - hand.skeleton[1:16:3].astype(dtype, copy=False)
+    target = markers[..., ends, :] - hand.skeleton[1:16:3].astype(dtype, copy=False)
     short = np.sqrt((target[..., None, :] @ target[..., None])[..., 0]) - reach
-    if not forms.all_end:
-        short = short * hand.end_markers[1].astype(dtype)[:, None]
+    if np.count_nonzero(has) < has.size:
+        short = short * has.astype(dtype)[:, None]
     damped = (slopes[..., None, :] @ slopes[..., None])[..., 0] + (BEND_NOISE / BEND_PRIOR) ** 2
     bend = slopes * (short / damped)
     angles = angles.copy()
@@ -220,10 +223,11 @@ def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
     return angles
 
 
-_WAVE_RATES = np.array([[0, 1, 1], [0, 1, 1]])
-_WAVE_PHASES = np.pi / 2 * np.array([[0, 0, -1], [1, 1, 0]])
-"""`[2, 3]` the angle times one, plus the other, and the cosine of that: 1, cosine and sine of the
-angle, and their derivatives."""
+def _waves(angles: Array) -> Array:
+    """`[..., 3]` 1, cosine and sine of `[...]`."""
+    waves = np.ones((*angles.shape, 3), angles.dtype)
+    waves[..., 1], waves[..., 2] = np.cos(angles), np.sin(angles)
+    return waves
 
 
 def place_fingers(
@@ -249,27 +253,26 @@ def place_fingers(
         `[..., 16, 3, 3]`, hand frame.
     """
     batch, dtype = angles.shape[:-1], angles.dtype
-    forms = _forms(hand)
-    waves = np.cos(angles[..., _FINGER_ANGLES, None] * _WAVE_RATES[0] + _WAVE_PHASES[0])
-    waves = waves.astype(dtype, copy=False)
+    forms, (ends, has) = _forms(hand), hand.end_markers
+    waves = _waves(angles[..., FINGER_ANGLES])
     products = waves[..., 0, :, None] * waves[..., 1, None, :]
     products = (products[..., None] * waves[..., 2, None, None, :]).reshape(*batch, 5, 2, 1, 27)
-    turn = (products[..., 0, :, :] @ _BASE_FORM.astype(dtype, copy=False)).reshape(*batch, 5, 3, 3)
+    turn = (products[..., 0, :, :] @ BASE_FORM.astype(dtype, copy=False)).reshape(*batch, 5, 3, 3)
     own = products[..., 1, :, :] @ forms.beyond.astype(dtype, copy=False)
     own = own.reshape(*batch, 5, 3, 10)
     base = hand.skeleton[1:16:3].astype(dtype, copy=False)
     if markers is not None:
         modelled = (turn @ own[..., 9:])[..., 0]
-        measured = markers[..., forms.ends, :] - base
-        if not forms.all_end:
-            measured = np.where(hand.end_markers[1][:, None] > 0, measured, modelled)
+        measured = markers[..., ends, :] - base
+        if np.count_nonzero(has) < has.size:
+            measured = np.where(has[:, None] > 0, measured, modelled)
         turn = shortest_arc(modelled, measured) @ turn
         angles = angles.copy()
         angles[..., BASE_ANGLES] = _euler(turn, JOINT_AXES[::3]) * _BASE_SIGNS.astype(dtype)
     placed = turn @ own[..., :9]
     positions = np.zeros((*batch, len(POINTS), 3), dtype)
     positions[..., 1:16:3, :] = base
-    positions[..., _BEYOND, :] = placed[..., :3].swapaxes(-1, -2) + base[..., None, :]
+    positions[..., BEYOND, :] = placed[..., :3].swapaxes(-1, -2) + base[..., None, :]
     rotations = np.empty((*batch, len(JOINTS), 3, 3), dtype)
     rotations[..., 0, :, :] = _EYE
     rotations[..., 1::3, :, :] = turn
@@ -278,15 +281,17 @@ def place_fingers(
     return angles, positions, rotations
 
 
-_FINGER_ANGLES = np.stack([BASE_ANGLES, OUTER_ANGLES], 1)
+FINGER_ANGLES = np.stack([BASE_ANGLES, OUTER_ANGLES], 1)
+"""`[5, 2, 3]` of each finger those of its base, and those beyond."""
 _BASE_SIGNS = SIGNS[BASE_ANGLES]
-_BEYOND = np.array(CHAINS)[:, 1:]
+BEYOND = np.array(CHAINS)[:, 1:]
 """`[5, 3]` the points of each finger after its base."""
 _TURN = "fiab,fjbc,fkcd->fijkad"
-_BASE_FORM = np.einsum(_TURN, *np.moveaxis(WAVES[:, 0], 1, 0)).reshape(5, 27, 9)
+BASE_FORM = np.einsum(_TURN, *np.moveaxis(WAVES[:, 0], 1, 0)).reshape(5, 27, 9)
+"""The rotation of a finger's base, linear in such products of its angles."""
 
 
-class _Forms(NamedTuple):
+class FingerForms(NamedTuple):
     """What stands beyond the fingers' bases, linear in products of 1, cosine and sine of the angles
     `OUTER_ANGLES`, the last one's running fastest."""
 
@@ -295,48 +300,54 @@ class _Forms(NamedTuple):
     rotations of the two joints; the outermost marker, metres."""
     square: Array
     """`[5, 9, 3]` m²: the square of that marker's distance from the base."""
-    ends: Array
-    """`[5]` which marker it is."""
-    all_end: bool
-    """True if all fingers have one."""
 
 
-@lru_cache(maxsize=16)
-def _forms(hand: Hand) -> _Forms:
-    first, side, last = np.moveaxis(WAVES[:, 1], 1, 0)
-    middle = np.einsum("fiab,fjbc->fijac", first, side)
-    outer = np.einsum(_TURN, first, side, last)
-    bones = hand.skeleton[_BEYOND]
-    arms = end_arms(hand)
+_FIRST, _SIDE, _LAST = np.moveaxis(WAVES[:, 1], 1, 0)
+_MIDDLE = np.einsum("fiab,fjbc->fijac", _FIRST, _SIDE)
+_OUTER = np.einsum(_TURN, _FIRST, _SIDE, _LAST)
+
+
+def finger_forms(hand: Hand, xp: Any = np) -> FingerForms:
+    """The forms of a hand's bones and markers; `xp` is numpy, or `jax.numpy` for traced ones."""
+    arms = end_arms(hand, xp)
+    # Of 1, cosine and sine: 1 alone.
+    one, middle, outer, last = (
+        xp.asarray(part, arms.dtype) for part in (np.eye(3)[0], _MIDDLE, _OUTER, _LAST)
+    )
 
     def point(parts: Array) -> Array:
         """`[5, 3, 3, 3, 3]` of three parts `[5, 3, 3]`, each carried by a further joint."""
-        form = np.einsum("fijkad,fd->fijka", outer, parts[:, 2])
-        form[:, :, :, 0] += np.einsum("fijac,fc->fija", middle, parts[:, 1])
-        form[:, 0, 0, 0] += parts[:, 0]
-        return form
+        near = xp.einsum("i,j,k,fa->fijka", one, one, one, parts[:, 0])
+        between = xp.einsum("fijac,fc,k->fijka", middle, parts[:, 1], one)
+        return near + between + xp.einsum("fijkad,fd->fijka", outer, parts[:, 2])
 
-    columns = np.zeros((5, 3, 3, 3, 3, 10))
-    for n in range(3):
-        columns[..., n] = point(bones * (np.arange(3) <= n)[:, None])
-    columns[:, :, :, 0, :, 3:6], columns[..., 6:9] = middle, outer
-    columns[..., 9] = point(arms)
-    out = np.einsum("fkcd,fd->fkc", last, arms[:, 2])
-    square = 2 * np.einsum("fa,fijac,fkc->fijk", arms[:, 0], middle, out)
-    square[..., 0] += 2 * np.einsum("fa,fijac,fc->fij", arms[:, 0], middle, arms[:, 1])
-    square[:, 0, 0] += 2 * np.einsum("fc,fkc->fk", arms[:, 1], out)
-    square[:, 0, 0, 0] += (arms * arms).sum((-1, -2))
-    ends, has = hand.end_markers
-    return _Forms(columns.reshape(5, 27, 30), square.reshape(5, 9, 3), ends, bool(has.all()))
+    bones = xp.asarray(hand.skeleton)[BEYOND]
+    points = [point(xp.where(np.arange(3)[:, None] <= n, bones, 0)) for n in range(3)]
+    turns = xp.einsum("fijac,k->fijkac", middle, one), outer
+    columns = [xp.stack(points, -1), *turns, point(arms)[..., None]]
+    out = xp.einsum("fkcd,fd->fkc", last, arms[:, 2])
+    inner = xp.einsum("fijac,fc,k->fijka", middle, arms[:, 1], one)
+    inner = inner + xp.einsum("fijac,fkc->fijka", middle, out)
+    square = 2 * xp.einsum("fa,fijka->fijk", arms[:, 0], inner)
+    square = square + 2 * xp.einsum("i,j,fc,fkc->fijk", one, one, arms[:, 1], out)
+    length = (arms * arms).sum((-1, -2))
+    square = square + xp.einsum("i,j,k,f->fijk", one, one, one, length)
+    beyond = xp.concatenate(columns, -1).reshape(5, 27, 30)
+    return FingerForms(beyond, square.reshape(5, 9, 3))
 
 
-def end_arms(hand: Hand) -> Array:
+_forms = lru_cache(maxsize=16)(finger_forms)
+
+
+def end_arms(hand: Hand, xp: Any = np) -> Array:
     """`[5, 3, 3]` metres: the way from each finger's base to its outermost marker, in the three
-    parts that its joints carry, from the base out; 0 where it has none."""
+    parts that its joints carry, from the base out; 0 where it has none. `xp` as above."""
     ends, has = hand.end_markers
     joints, links = (places[ends, None] for places in hand.placing)
     level = np.arange(3)
     between = (np.array(CHAINS) == joints).argmax(-1)[:, None] > level
-    bones = hand.skeleton[np.array(CHAINS)[:, 1:]] * between[..., None]
-    own = hand.offsets[ends, None] * ((links - 1) % 3 == level)[..., None]
-    return has[:, None, None] * (bones + own)
+    skeleton, offsets = xp.asarray(hand.skeleton), xp.asarray(hand.offsets)
+    carries = has[:, None] > 0
+    bones = xp.where((carries & between)[..., None], skeleton[BEYOND], 0)
+    own = (carries & ((links - 1) % 3 == level))[..., None]
+    return bones + xp.where(own, offsets[ends, None].astype(skeleton.dtype), 0)

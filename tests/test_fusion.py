@@ -28,6 +28,7 @@ from jaxhand.fusion import (  # noqa: E402
     simulate_imu,
 )
 from numpy_infer.arrays import Array  # noqa: E402
+from numpy_infer.geometry import PRIOR_STRENGTH  # noqa: E402
 from numpy_infer.hand import ANGLES, FINGERS, JOINTS, PARENTS, POINTS, Hand, load_hand  # noqa: E402
 from numpy_infer.recordings import JointTruth, Recording, read  # noqa: E402
 from numpy_infer.skeleton import (  # noqa: E402
@@ -183,16 +184,21 @@ def test_a_rigid_motion_of_the_markers_moves_the_wrist_alone(motion: tuple[Array
     seen = np.where(visible[..., None], markers, np.nan)
     seen[:5, 2:] = seen[60:70, 2:] = seen[100:110] = np.nan
     aligned = np.isfinite(seen[:, list(hand.alignment)]).all((-1, -2))
+    # Two markers leave the turn about their line to the frame before, by way of a prior which is
+    # that much weaker than they are: float32's rounding counts as often, and adds up.
+    frame = np.arange(len(seen))
+    since = frame - np.maximum.accumulate(np.where(aligned, frame, -1))
+    rounding = np.finfo(np.float32).eps / 2 * 1e-3 / PRIOR_STRENGTH
     for method in METHODS.values():
         here = method(hand, glove, seen, 1 / RATE)
         there = method(hand, glove, seen @ rotation.T + translation, 1 / RATE)
         np.testing.assert_allclose(there.rotations, here.rotations, atol=3e-4)
         wrist = rotation @ here.wrist_rotation
         origin = here.wrist_position @ rotation.T + translation
-        # Two markers leave the turn about their line to the frame before: rounding adds up there.
-        for frames, radians, metres in ((aligned, 2e-4, 2e-5), (~aligned, 1e-3, 1e-4)):
-            np.testing.assert_allclose(there.wrist_rotation[frames], wrist[frames], atol=radians)
-            np.testing.assert_allclose(there.wrist_position[frames], origin[frames], atol=metres)
+        turned = np.abs(there.wrist_rotation - wrist).max((-1, -2))
+        assert (turned < 2e-4 + rounding * since).all()
+        shifted = np.abs(there.wrist_position - origin).max(-1)
+        assert (shifted < 2e-5 + 0.1 * rounding * since).all()
 
 
 def gap() -> tuple[Fused, Array, Array]:

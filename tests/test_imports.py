@@ -29,8 +29,9 @@ ONE_SIDED = {
     # What XLA must be told about small matrix products; numpy has `@`.
     # And halves of `kabsch`, for the pipeline of one frame; XLA takes apart what it compiles.
     "geometry": {"apart", "inner", "product", "pattern", "fit"},
-    # An IMU glove's rotations are no angles; the runtime has its fingers from angles.
-    "skeleton": {"align_fingers"},
+    # An IMU glove's rotations are no angles; the runtime has its fingers from angles. The forms of
+    # a hand are one function for both sides.
+    "skeleton": {"align_fingers", "finger_forms", "end_arms"},
     # Many steady frames at once: JAX scans over them.
     "continuity": {"together", "each"},
     "gate": {"quietly", "reach"},  # and a table that both sides share
