@@ -30,6 +30,7 @@ from jaxhand.output import leading, wrist_pose
 from jaxhand.predictors import PREDICTORS, learned_step, predicted_markers
 from numpy_infer.arrays import Array
 from numpy_infer.continuity import (
+    DRIFT_UNSEEN,
     FARTHEST_CORRECTION,
     SAME_POSTURE,
     SHRINK_SPEED,
@@ -94,18 +95,22 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
     seen = jnp.where(visible[..., None], registered, seen)
     correction, anchor, seen = apart((correction, anchor, seen))
 
+    change = _change(anchor, registered, visible)
     if model.continuity:
-        correction, blend = _blend(model, correction, anchor, registered, visible, tracking, dt)
+        correction, blend = _blend(model, correction, change, visible, tracking, dt)
         blended = transform(rotation, translation, registered + blend)
         raw = jnp.where((blend != 0).any(-1, keepdims=True), blended, raw)
 
     wrist = apart(wrist_pose(model, raw, rotation))
-    age = jnp.where(visible, 0, state.age + dt[..., None])
+    gone = jnp.where(state.visible, 0, state.drift + state.change[..., None])
+    drift = jnp.where(changed[..., None], gone, state.drift)
+    drift = drift + jnp.where(tracking, 0, DRIFT_UNSEEN * dt)[..., None]
     return State(
         right=state.right,
         gate=state.gate,
         rejected=jnp.zeros_like(visible),
         predictor=advance,
+        smoothing=state.smoothing,
         output=raw,
         wrist_rotation=wrist[0],
         wrist_position=wrist[1],
@@ -120,7 +125,8 @@ def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array
         correction=correction,
         anchor=anchor,
         prior=prior,
-        age=age,
+        drift=jnp.where(visible, 0, drift),
+        change=change,
     )
 
 
@@ -274,11 +280,19 @@ def _motion(
     )
 
 
+def _change(anchor: Array, registered: Array, visible: Array) -> Array:
+    """`[...]` metres, RMS: how far the visible markers have gone in the registered frame since the
+    corrections were set; 0 where none is hidden."""
+    difference = jnp.where(visible[..., None], registered - anchor, 0)
+    seen = jnp.maximum(visible.sum(-1), 1).astype(registered.dtype)
+    distance = jnp.sqrt((difference * difference).sum((-1, -2)) / seen)
+    return jnp.where(visible.all(-1), 0, distance)
+
+
 def _blend(
     model: Model,
     correction: Array,
-    anchor: Array,
-    registered: Array,
+    change: Array,
     visible: Array,
     tracking: Array,
     dt: Array,
@@ -288,10 +302,7 @@ def _blend(
     left = jnp.maximum(length - SHRINK_SPEED * dt[..., None], 0)
     share = jnp.where(visible & (length > 0), left / jnp.where(length > 0, length, 1), 1)
     correction = correction * share[..., None]
-    difference = jnp.where(visible[..., None], registered - anchor, 0)
-    seen = jnp.maximum(visible.sum(-1), 1).astype(registered.dtype)
-    distance = jnp.sqrt((difference * difference).sum((-1, -2)) / seen)
-    fade = jnp.where(tracking, jnp.exp(-distance / model.fade), 0)
+    fade = jnp.where(tracking, jnp.exp(-change / model.fade), 0)
     blend = jnp.where(visible[..., None], correction, correction * fade[..., None, None])
     return correction, blend
 

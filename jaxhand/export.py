@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxhand import evaluation
+from jaxhand import evaluation, expected_error
 from jaxhand.networks import predict
 from jaxhand.sequences import Sequence as MarkerSequence
 from numpy_infer import model as model_file
@@ -30,8 +30,8 @@ def finish(
     sequences: Sequence[MarkerSequence],
     report: Callable[[str], None] = lambda text: None,
 ) -> Model:
-    """Chooses δ of the continuity blend and measures the table of expected errors, both on
-    validation sequences. A model without a marker network, or sequences too short, stay as is."""
+    """Chooses δ of the continuity blend and measures what error to expect, both on validation
+    sequences. A model without a marker network, or sequences too short, stay as is."""
     if model.marker_network is None:
         return model
     try:
@@ -40,28 +40,32 @@ def finish(
         report(f"fade and expected error keep their defaults: {error}")
         return model
     learned = replace(model, predictor="learned", joints="none")
-    tables = {
-        fade: evaluation.table3({"": replace(learned, fade=fade)}, sequences, seeds=1)[""]
+    means = {
+        fade: _mean(evaluation.table3({"": replace(learned, fade=fade)}, sequences, seeds=1)[""])
         for fade in FADES
     }
-    means = {fade: _means(table) for fade, table in tables.items()}
-    fade = min(FADES, key=lambda fade: np.nanmean(means[fade]))
+    fade = min(FADES, key=means.__getitem__)
     report(f"fade δ = {1e3 * fade:.0f} mm")
-    # Where validation is too short for the longest gaps, the last measured one stands for them.
-    filled = means[fade].copy()
-    for column in range(1, filled.shape[1]):
-        missing = np.isnan(filled[:, column])
-        filled[missing, column] = filled[missing, column - 1]
-    table = np.concatenate([np.zeros((len(filled), 1)), 1e-2 * filled], -1)
-    return replace(model, fade=fade, expected_error=table)
+    return with_expected_error(replace(model, fade=fade), sequences, report)
 
 
-def _means(table: dict[str, dict[str, evaluation.Cell]]) -> np.ndarray:
-    """`[counts, durations]` cm; NaN where there was no trial."""
-    rows = [
-        [np.nan if c["mean"] is None else c["mean"] for c in row.values()] for row in table.values()
-    ]
-    return np.array(rows)
+def _mean(table: dict[str, dict[str, evaluation.Cell]]) -> float:
+    """cm, over all cells with a trial."""
+    cells = [cell["mean"] for row in table.values() for cell in row.values()]
+    return float(np.mean([mean for mean in cells if mean is not None]))
+
+
+def with_expected_error(
+    model: Model,
+    sequences: Sequence[MarkerSequence],
+    report: Callable[[str], None] = lambda text: None,
+) -> Model:
+    """The model with the errors to expect as they are measured on sequences of validation."""
+    samples = expected_error.measure(replace(model, predictor="learned", joints="none"), sequences)
+    if len(samples.measured) < expected_error.FEWEST:
+        report(f"expected error keeps its defaults: only {len(samples.measured)} hidden markers")
+        return model
+    return replace(model, **expected_error.fit(samples, len(model.hand))._asdict())
 
 
 def export(model: Model, path: str | Path, *, overwrite: bool = False) -> Model:

@@ -22,8 +22,11 @@ for _kind, _data, _meta in (
     ),
     (
         Model,
-        ("hand", "wearer", "flat", "marker_network", "joint_network", "fade", "expected_error"),
-        ("predictor", "joints", "alignment", "gate", "continuity"),
+        (
+            *("hand", "wearer", "flat", "marker_network", "joint_network", "fade"),
+            *("expected_error", "marker_error", "faded_error"),
+        ),
+        ("predictor", "joints", "alignment", "gate", "smoothing", "continuity"),
     ),
 ):
     jax.tree_util.register_dataclass(_kind, _data, _meta, drop_fields=["training"])

@@ -7,11 +7,13 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from jaxhand import one_euro
 from jaxhand.geometry import kabsch, mirror, mirror_rotation
 from jaxhand.joints import joint_stage
 from jaxhand.predictors import PREDICTORS
 from numpy_infer.arrays import Array
-from numpy_infer.model import ERROR_AGES, Model
+from numpy_infer.model import ERROR_CHANGES, Model
+from numpy_infer.one_euro import Smoothing
 from numpy_infer.output import HUGE
 from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
 
@@ -21,6 +23,16 @@ def wrist_pose(model: Model, output: Array, prior: Array) -> tuple[Array, Array]
     template = jnp.asarray(model.body.template, output.dtype)
     alignment = jnp.asarray(model.hand.alignment_weight, output.dtype)
     return kabsch(template, output, jnp.broadcast_to(alignment, output.shape[:-1]), prior)
+
+
+def smoothed(model: Model, smoothing: Smoothing, state: State, dt: Array) -> tuple[State, State]:
+    """The state after the output filter's frame, and the same with what is to be shown in it."""
+    # What the template stands in for is no past of the hand's.
+    own = state.smoothing._replace(begun=state.smoothing.begun & state.tracked)
+    own, output = one_euro.step(smoothing, own, state.output, dt)
+    rotation, position = wrist_pose(model, output, state.wrist_rotation)
+    state = state._replace(smoothing=own)
+    return state, state._replace(output=output, wrist_rotation=rotation, wrist_position=position)
 
 
 def hand_pose(model: Model, state: State, late: Array) -> HandPose:
@@ -34,7 +46,7 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
     pose = HandPose(
         markers=state.output,
         status=jnp.where(state.rejected, int(Status.REJECTED), status),
-        expected_error=_expected_error(model, state.visible, state.age),
+        expected_error=_expected_error(model, state),
         wrist_rotation=state.wrist_rotation,
         wrist_position=state.wrist_position,
         **joint_stage(model, state.output, state.wrist_rotation, state.wrist_position),
@@ -46,15 +58,21 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
     return _to_side(pose, state.right)
 
 
-def _expected_error(model: Model, visible: Array, age: Array) -> Array:
-    """`[..., M]` metres, from the model's table by number hidden and age."""
-    table = jnp.asarray(model.expected_error, age.dtype)
-    hidden = (~visible).sum(-1)
+def _expected_error(model: Model, state: State) -> Array:
+    """`[..., M]` metres: the marker's share of the model's table by number hidden and change of
+    posture, and what its correction has lost."""
+    dtype = state.drift.dtype
+    table = jnp.asarray(model.expected_error, dtype)
+    hidden = (~state.visible).sum(-1)
     row = table[jnp.clip(hidden, 1, len(table)) - 1][..., None, :]
-    ages = jnp.array(ERROR_AGES, age.dtype)
-    share = jnp.clip((age[..., None] - ages[:-1]) / (ages[1:] - ages[:-1]), 0, 1)
-    error = row[..., 0] + ((row[..., 1:] - row[..., :-1]) * share).sum(-1)
-    return jnp.where(visible, 0, error)
+    changes = jnp.array(ERROR_CHANGES, dtype)
+    gone = (state.drift + state.change[..., None])[..., None]
+    share = jnp.clip((gone - changes[:-1]) / (changes[1:] - changes[:-1]), 0, 1)
+    off = row[..., 0] + ((row[..., 1:] - row[..., :-1]) * share).sum(-1)
+    off = off if model.marker_error is None else off * jnp.asarray(model.marker_error, dtype)
+    faded = model.faded_error * (1 - jnp.exp(-state.change / model.fade))
+    length = jnp.sqrt((state.correction * state.correction).sum(-1))
+    return jnp.where(state.visible, 0, off + faded[..., None] * length)
 
 
 def _to_side(pose: HandPose, right: Array) -> HandPose:

@@ -10,13 +10,13 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from jaxhand import gate
+from jaxhand import gate, one_euro
 from jaxhand.continuity import advance
 from jaxhand.geometry import mirror
-from jaxhand.output import hand_pose
+from jaxhand.output import hand_pose, smoothed
 from jaxhand.predictors import PREDICTORS
 from numpy_infer.arrays import Array
-from numpy_infer.model import ERROR_AGES, Model
+from numpy_infer.model import ERROR_CHANGES, Model
 from numpy_infer.pose import HandPose, State
 from numpy_infer.tracker import FARTHEST, LONGEST, SHOWN
 
@@ -48,6 +48,7 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         gate=gate.init(model, batch) if model.gate else (),
         rejected=never,
         predictor=PREDICTORS[model.predictor].init(model, batch),
+        smoothing=() if model.smoothing is None else one_euro.init(template),
         output=template,
         wrist_rotation=eye,
         wrist_position=origin,
@@ -62,7 +63,8 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         correction=jnp.zeros_like(template),
         anchor=template,
         prior=eye,
-        age=jnp.full((*batch, count), ERROR_AGES[-1], dtype),
+        drift=jnp.full((*batch, count), ERROR_CHANGES[-1], dtype),
+        change=jnp.zeros(batch, dtype),
     )
 
 
@@ -81,8 +83,10 @@ def step(
             time moves, and the same markers again change nothing.
     """
     markers, visible, elapsed, late = _cleaned(state, markers, visible, dt)
-    state = advance(model, state, markers, visible, elapsed, late)
-    return state, hand_pose(model, state, late)
+    state = shown = advance(model, state, markers, visible, elapsed, late)
+    if model.smoothing is not None:
+        state, shown = smoothed(model, model.smoothing, state, elapsed)
+    return state, hand_pose(model, shown, late)
 
 
 def run(
@@ -103,8 +107,10 @@ def run(
     markers, visible, elapsed, late = _cleaned(state, markers, visible, dt)
 
     def frame(state: State, of: tuple[Array, ...]) -> tuple[State, dict[str, Array]]:
-        state = advance(model, state, *of)
-        return state, {name: getattr(state, name) for name in SHOWN}
+        state = shown = advance(model, state, *of)
+        if model.smoothing is not None:
+            state, shown = smoothed(model, model.smoothing, state, of[2])
+        return state, {name: getattr(shown, name) for name in SHOWN}
 
     # Joints depend on their own frame alone: they are made of all frames at once.
     state, shown = jax.lax.scan(frame, state, (markers, visible, elapsed, late))

@@ -17,6 +17,7 @@ from numpy_infer import wearer
 from numpy_infer.hand import Hand, bundled, load_hand
 from numpy_infer.model import Model, load
 from numpy_infer.model import bundled as bundled_models
+from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import Notice, Status, TrackingState
 from numpy_infer.predictors import BASELINES, PREDICTORS
 from numpy_infer.recordings import Recording, load_label_map, read, write
@@ -115,6 +116,15 @@ def parser() -> argparse.ArgumentParser:
     )
     tracked.add_argument(
         "--no-gate", action="store_true", help="believe every measurement, wrong ones, too"
+    )
+    tracked.add_argument(
+        "--smooth",
+        nargs="?",
+        type=float,
+        const=Smoothing().min_cutoff,
+        metavar="HZ",
+        help="let less jitter through, for some lag; HZ is the cutoff at rest (default "
+        f"{Smoothing().min_cutoff:g})",
     )
     tracked.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     tracked.set_defaults(run=_track)
@@ -219,6 +229,11 @@ def _track(options: argparse.Namespace) -> None:
     if options.joints:
         model = replace(model, joints=options.joints)
     model = replace(model, alignment=not options.no_alignment, gate=not options.no_gate)
+    if options.smooth is not None:
+        smoothing = Smoothing(options.smooth)
+        model = replace(model, smoothing=smoothing)
+        at_rest, moving = (1e3 * smoothing.lag(speed) for speed in (0, 1))
+        print(f"smoothed: {at_rest:.0f} ms late at rest, {moving:.0f} ms at 1 m/s")
     if options.calibration:
         model = wearer.calibrated(model, wearer.load(options.calibration))
     show = sys.stderr.isatty()

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import resources
-from math import prod
+from math import inf, prod
 from pathlib import Path
 from typing import IO, Any
 
@@ -25,6 +25,7 @@ from numpy_infer.formats.json_text import parse_json
 from numpy_infer.formats.refusal import refusal
 from numpy_infer.hand import ANGLES, Hand, hand_from_json
 from numpy_infer.networks import Network, array_shapes, read_spec, write_spec
+from numpy_infer.one_euro import Smoothing
 
 WEIGHTS = resources.files("numpy_infer") / "weights"
 """Where the bundled models lie."""
@@ -37,16 +38,18 @@ SIZE_LIMIT = 64 << 20
 HEADER_LIMIT = 1 << 20
 """Bytes: more than this is no header of ours."""
 
-ERROR_AGES = (0.0, 0.1, 0.2, 0.5, 1.0, 2.0)
-"""Seconds hidden at which `Model.expected_error` stands; between them it is linear."""
+ERROR_CHANGES = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016)
+"""Metres: changes of posture, RMS of the visible markers, at which `Model.expected_error` stands;
+between them it is linear."""
 
-PAPER_AFFINE_ERROR = (
-    (0.0, 0.0097, 0.0154, 0.0242, 0.0292, 0.0367),
-    (0.0, 0.0106, 0.0169, 0.0261, 0.0347, 0.0412),
-    (0.0, 0.0122, 0.0196, 0.0295, 0.0365, 0.0452),
-    (0.0, 0.0166, 0.0268, 0.0406, 0.0534, 0.0545),
+AFFINE_ERROR = (
+    (0.0002, 0.0018, 0.0033, 0.0061, 0.0075, 0.0404),
+    (0.0002, 0.0018, 0.0034, 0.0062, 0.0077, 0.0414),
+    (0.0002, 0.0019, 0.0035, 0.0064, 0.0080, 0.0427),
+    (0.0008, 0.0066, 0.0122, 0.0226, 0.0280, 0.1498),
 )
-"""Metres, the paper's Table 3, rows AC: what is expected of a model nobody has measured."""
+"""Metres: what is expected of a model nobody has measured, the predictor `affine` on simulated
+people."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,8 @@ class Model:
     for half as much time again, so a choice of whoever runs the model, not of its file."""
     gate: bool = False
     """Notice wrong measurements and treat them as hidden, see `gate`. Likewise a choice."""
+    smoothing: Smoothing | None = None
+    """Low-pass what is given out, see `one_euro`: less jitter, more lag. Likewise a choice."""
     wearer: Hand | None = None
     """The same markers on the bones of whoever wears the glove: what joints and wrist pose are made
     with; None stands for `hand`. Comes from a calibration, not from the model file."""
@@ -76,15 +81,26 @@ class Model:
     """Metres: δ of the continuity blend, see `tracker`."""
     continuity: bool = True
     """Blend the output; without it predictors stand bare, as in the authors' program."""
-    expected_error: Array = field(default_factory=lambda: np.array(PAPER_AFFINE_ERROR))
-    """`[K, 6]` metres: mean error with 1…K markers hidden, at `ERROR_AGES`."""
+    expected_error: Array = field(default_factory=lambda: np.array(AFFINE_ERROR))
+    """`[K, 6]` metres: mean error with 1…K markers hidden, once the posture has changed by
+    `ERROR_CHANGES` since the marker was measured."""
+    marker_error: Array | None = None
+    """`[M]` each marker's error as a multiple of that; None: all alike."""
+    faded_error: float = 0.0
+    """Metres of error to expect for each metre by which the marker's correction has faded: its
+    length is what the predictor was off when the marker was lost."""
     training: Mapping[str, Any] = field(default_factory=dict)
     """Plain data about how the model was made and measured."""
 
     @cached_property
     def error_growth(self) -> Array:
-        """`[K, 5]` m/s: how fast `expected_error` grows between `ERROR_AGES`."""
-        return np.diff(self.expected_error) / np.diff(ERROR_AGES)
+        """`[K, 5]` how fast `expected_error` grows between `ERROR_CHANGES`."""
+        return np.diff(self.expected_error) / np.diff(ERROR_CHANGES)
+
+    @cached_property
+    def error_factors(self) -> Array:
+        """`[M]` what `marker_error` is or stands for."""
+        return np.ones(len(self.hand)) if self.marker_error is None else self.marker_error
 
     @property
     def body(self) -> Hand:
@@ -97,6 +113,10 @@ class Model:
                 f"the wearer's markers {', '.join(self.wearer.markers)} are not the model's: "
                 f"{', '.join(self.hand.markers)}"
             )
+        if self.smoothing is not None:
+            least, beta, derivative = self.smoothing
+            if not (0 < least < inf and 0 <= beta < inf and 0 < derivative < inf):
+                raise ValueError(f"smoothing: expected positive cutoffs, received {self.smoothing}")
         if self.joints not in ("learned", "none"):
             raise ValueError(f"unknown joint stage {self.joints!r}: expected 'learned' or 'none'")
         inputs = 3 * len(self.hand)
@@ -122,7 +142,10 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
     path = Path(path)
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists: choose another name, or ask to overwrite it")
-    arrays = {"expected_error": np.asarray(model.expected_error, np.float64)}
+    arrays = {
+        "expected_error": np.asarray(model.expected_error, np.float64),
+        "marker_error": np.asarray(model.error_factors, np.float64),
+    }
     networks = {}
     for name in ("marker_network", "joint_network"):
         network = getattr(model, name)
@@ -137,6 +160,7 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
         "joints": model.joints,
         "networks": networks,
         "fade": float(model.fade),
+        "faded_error": float(model.faded_error),
         "continuity": bool(model.continuity),
         "training": dict(model.training),
     }
@@ -145,7 +169,7 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
     except TypeError as error:
         raise ValueError(f"'training' must be plain data: {error}") from None
     _check_header(header)
-    _check_expected_error(arrays["expected_error"])
+    _check_errors(arrays, len(model.hand))
     header["checksum"] = _checksum(header, arrays)
     text = json.dumps(header, indent=1).encode()
     buffer = io.BytesIO()
@@ -240,7 +264,7 @@ def _read(archive: zipfile.ZipFile) -> Model:
             f"written in version {header.get('version')!r}, this program reads version {VERSION}"
         )
     expected = {"format", "version", "hand", "predictor", "joints", "networks", "fade"}
-    expected |= {"continuity", "training", "checksum"}
+    expected |= {"faded_error", "continuity", "training", "checksum"}
     if set(header) != expected or not isinstance(header["networks"], dict):
         raise ValueError(f"damaged header: expected {sorted(expected)}, found {sorted(header)}")
     for name in sorted(set(header["networks"]) - {"marker_network", "joint_network"}):
@@ -256,13 +280,14 @@ def _read(archive: zipfile.ZipFile) -> Model:
             scaling |= {"output_mean": (outputs,), "output_scale": (outputs,)}
             wanted = array_shapes(specs[name], inputs) | scaling
             shapes |= {f"{name}/{key}": shape for key, shape in wanted.items()}
+    shapes["marker_error"] = (len(hand),)
     names = {f"{name}.npy" for name in (*shapes, "expected_error", "header")}
     for part in sorted(names ^ set(sizes)):
         raise ValueError(f"array {part[:-4]!r} is {'missing' if part in names else 'unexpected'}")
     arrays = {name: _array(archive, name, shape) for name, shape in shapes.items()}
-    table = _array(archive, "expected_error", (None, len(ERROR_AGES)), HEADER_LIMIT)
-    arrays["expected_error"] = table
-    _check_expected_error(table)
+    table = (None, len(ERROR_CHANGES))
+    arrays["expected_error"] = _array(archive, "expected_error", table, HEADER_LIMIT)
+    _check_errors(arrays, len(hand))
     checksum = header.pop("checksum")
     if _checksum(header, arrays) != checksum:
         raise ValueError("the checksum does not fit: the file is damaged")
@@ -277,6 +302,8 @@ def _read(archive: zipfile.ZipFile) -> Model:
         fade=header["fade"],
         continuity=header["continuity"],
         expected_error=arrays["expected_error"],
+        marker_error=arrays["marker_error"],
+        faded_error=header["faded_error"],
         training=header["training"],
         **networks,
     )
@@ -284,19 +311,29 @@ def _read(archive: zipfile.ZipFile) -> Model:
 
 def _check_header(header: Mapping[str, Any]) -> None:
     kinds: dict[str, type] = {"predictor": str, "joints": str, "fade": float, "training": dict}
-    kinds["continuity"] = bool
+    kinds |= {"faded_error": float, "continuity": bool}
     for key, kind in kinds.items():
         if not isinstance(header[key], kind):
             raise ValueError(f"header: expected {key!r} as {kind.__name__}, found {header[key]!r}")
     if not 0 < header["fade"] < float("inf"):
         raise ValueError(f"header: 'fade' must be positive metres, found {header['fade']}")
+    if not 0 <= header["faded_error"] < float("inf"):
+        raise ValueError(
+            f"header: 'faded_error' must not be negative, found {header['faded_error']}"
+        )
 
 
-def _check_expected_error(table: Array) -> None:
-    fits = table.ndim == 2 and len(table) and table.shape[1] == len(ERROR_AGES)
+def _check_errors(arrays: Mapping[str, Array], markers: int) -> None:
+    table, factors = arrays["expected_error"], arrays["marker_error"]
+    fits = table.ndim == 2 and len(table) and table.shape[1] == len(ERROR_CHANGES)
     if not fits or not np.isfinite(table).all():
         raise ValueError(
-            f"array 'expected_error': expected finite [K, {len(ERROR_AGES)}], found {table.shape}"
+            f"array 'expected_error': expected finite [K, {len(ERROR_CHANGES)}], "
+            f"found {table.shape}"
+        )
+    if factors.shape != (markers,) or not (np.isfinite(factors) & (factors >= 0)).all():
+        raise ValueError(
+            f"array 'marker_error': expected [{markers}], none negative, found {factors.shape}"
         )
 
 

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from numpy_infer import one_euro
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import kabsch, mirror, mirror_rotation
 from numpy_infer.joints import joint_stage
-from numpy_infer.model import ERROR_AGES, Model
+from numpy_infer.model import ERROR_CHANGES, Model
+from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
 from numpy_infer.predictors import PREDICTORS
 
@@ -23,6 +25,16 @@ def wrist_pose(model: Model, output: Array, prior: Array) -> tuple[Array, Array]
     template = model.body.template.astype(output.dtype, copy=False)
     alignment = model.hand.alignment_weight.astype(output.dtype, copy=False)
     return kabsch(template, output, alignment, prior)
+
+
+def smoothed(model: Model, smoothing: Smoothing, state: State, dt: Array) -> tuple[State, State]:
+    """The state after the output filter's frame, and the same with what is to be shown in it."""
+    # What the template stands in for is no past of the hand's.
+    own = state.smoothing._replace(begun=state.smoothing.begun & state.tracked)
+    own, output = one_euro.step(smoothing, own, state.output, dt)
+    rotation, position = wrist_pose(model, output, state.wrist_rotation)
+    state = state._replace(smoothing=own)
+    return state, state._replace(output=output, wrist_rotation=rotation, wrist_position=position)
 
 
 def hand_pose(model: Model, state: State, late: Array) -> HandPose:
@@ -47,7 +59,7 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
     pose = HandPose(
         markers=state.output.copy(),
         status=status,
-        expected_error=_expected_error(model, visible, state.age),
+        expected_error=_expected_error(model, state),
         wrist_rotation=state.wrist_rotation.copy(),
         wrist_position=state.wrist_position.copy(),
         **joint_stage(model, state.output, state.wrist_rotation, state.wrist_position),
@@ -57,20 +69,24 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
     return _to_side(pose, state.right) if np.count_nonzero(state.right) else pose
 
 
-def _expected_error(model: Model, visible: Array, age: Array) -> Array:
-    """`[..., M]` metres, from the model's table by number hidden and age."""
-    hidden = ~visible
+def _expected_error(model: Model, state: State) -> Array:
+    """`[..., M]` metres: the marker's share of the model's table by number hidden and change of
+    posture, and what its correction has lost."""
+    hidden, dtype = ~state.visible, state.drift.dtype
     if not np.count_nonzero(hidden):
-        return np.zeros_like(age)
-    table = model.expected_error.astype(age.dtype, copy=False)
-    row = np.minimum(np.maximum(hidden.sum(-1), 1), len(table)) - 1
-    spent = np.minimum(np.maximum(age[..., None] - _AGES, 0), _AGE_STEPS).astype(age.dtype)
-    grown = (spent @ model.error_growth.astype(age.dtype, copy=False)[row][..., None])[..., 0]
-    return (table[row, 0][..., None] + grown) * hidden
+        return np.zeros_like(state.drift)
+    row = np.minimum(np.maximum(hidden.sum(-1), 1), len(model.expected_error)) - 1
+    gone = (state.drift + state.change[..., None])[..., None] - _CHANGES
+    steps = np.minimum(np.maximum(gone, 0), _CHANGE_STEPS)
+    grown = (steps @ model.error_growth[row][..., None])[..., 0]
+    off = (model.expected_error[row, 0][..., None] + grown) * model.error_factors
+    faded = model.faded_error * (1 - np.exp(-state.change / model.fade))
+    length = np.sqrt((state.correction * state.correction).sum(-1))
+    return ((off + faded[..., None] * length) * hidden).astype(dtype, copy=False)
 
 
-_AGES = np.array(ERROR_AGES[:-1])
-_AGE_STEPS = np.diff(ERROR_AGES)
+_CHANGES = np.array(ERROR_CHANGES[:-1])
+_CHANGE_STEPS = np.diff(ERROR_CHANGES)
 
 
 def _to_side(pose: HandPose, right: Array) -> HandPose:

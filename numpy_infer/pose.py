@@ -90,8 +90,10 @@ class State(NamedTuple):
     """`[..., M]` True where measured but refused."""
     predictor: Any
     """State of the model's predictor."""
+    smoothing: Any
+    """State of the output filter; () without one."""
     output: Array
-    """`[..., M, 3]` all markers as the previous frame gave them."""
+    """`[..., M, 3]` all markers as the previous frame gave them, before the output filter."""
     wrist_rotation: Array
     """`[..., 3, 3]` world_from_wrist, likewise."""
     wrist_position: Array
@@ -120,6 +122,8 @@ class State(NamedTuple):
     prior: Array
     """`[..., 3, 3]` anchor_from_template before the corrections were set: what the registration
     follows as long as the visible set is the same, where markers do not determine it."""
-    age: Array
-    """`[..., M]` seconds since the marker was measured; as old as the table of expected errors goes
-    for one that never was."""
+    drift: Array
+    """`[..., M]` metres: how far the posture had gone, when the corrections were set, since the
+    marker was measured; as far as the table of expected errors goes for one that never was."""
+    change: Array
+    """`[...]` metres, RMS of the visible markers: how far it has gone since; 0 with none hidden."""

@@ -14,13 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from numpy_infer import gate, wearer
+from numpy_infer import gate, one_euro, wearer
 from numpy_infer.arrays import Array
 from numpy_infer.continuity import advance, each, together
 from numpy_infer.geometry import mirror
 from numpy_infer.hand import Hand
-from numpy_infer.model import ERROR_AGES, Model, load
-from numpy_infer.output import hand_pose
+from numpy_infer.model import ERROR_CHANGES, Model, load
+from numpy_infer.one_euro import Filter, Smoothing
+from numpy_infer.output import hand_pose, smoothed, wrist_pose
 from numpy_infer.pose import HandPose, State
 from numpy_infer.predictors import PREDICTORS, learned_step
 
@@ -56,6 +57,7 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         gate=gate.init(model, batch) if model.gate else (),
         rejected=never,
         predictor=PREDICTORS[model.predictor].init(model, batch),
+        smoothing=() if model.smoothing is None else one_euro.init(template),
         output=template,
         wrist_rotation=eye,
         wrist_position=origin,
@@ -70,7 +72,8 @@ def init(model: Model, batch: tuple[int, ...] = (), right: Array = False) -> Sta
         correction=np.zeros_like(template),
         anchor=template,
         prior=eye,
-        age=np.full((*batch, count), ERROR_AGES[-1], dtype),
+        drift=np.full((*batch, count), ERROR_CHANGES[-1], dtype),
+        change=np.zeros(batch, dtype),
     )
 
 
@@ -89,8 +92,10 @@ def step(
             time moves, and the same markers again change nothing.
     """
     markers, visible, elapsed, late = _cleaned(state, markers, visible, dt)
-    state = advance(model, state, markers, visible, elapsed, late)
-    return state, hand_pose(model, state, late)
+    state = shown = advance(model, state, markers, visible, elapsed, late)
+    if model.smoothing is not None:
+        state, shown = smoothed(model, model.smoothing, state, elapsed)
+    return state, hand_pose(model, shown, late)
 
 
 def run(
@@ -139,12 +144,29 @@ def run(
             state = each(lambda leaf: leaf[-1], states)
             done = frames.stop
     right = np.broadcast_to(state.right, late.shape)
-    return state, hand_pose(model, state._replace(right=right, **shown), late)
+    every = state._replace(right=right, **shown)
+    if model.smoothing is not None:
+        own, every = _smoothed(model, model.smoothing, state, every, elapsed)
+        state = state._replace(smoothing=own)
+    return state, hand_pose(model, every, late)
+
+
+def _smoothed(
+    model: Model, smoothing: Smoothing, state: State, every: State, dt: Array
+) -> tuple[Filter, State]:
+    """The output filter's state after many frames, and `every` state with what is to be shown."""
+    # The filter goes frame by frame; the wrists' poses wait until all are done.
+    own, output = state.smoothing, np.empty_like(every.output)
+    for i, (tracked, markers) in enumerate(zip(every.tracked, every.output, strict=True)):
+        own = own._replace(begun=own.begun & tracked)
+        own, output[i] = one_euro.step(smoothing, own, markers, dt[i])
+    rotation, position = wrist_pose(model, output, every.wrist_rotation)
+    return own, every._replace(output=output, wrist_rotation=rotation, wrist_position=position)
 
 
 SHOWN = (
     *("rejected", "output", "wrist_rotation", "wrist_position", "visible", "tracked", "tracking"),
-    *("seen", "age"),
+    *("seen", "correction", "drift", "change"),
 )
 """Fields of `State` that the pose is made of."""
 
@@ -191,17 +213,19 @@ class HandTracker:
         calibration: str | Path | None = None,
         alignment: bool = False,
         gate: bool = True,
+        smoothing: Smoothing | None = None,
         right: bool | Sequence[bool] = False,
     ) -> HandTracker:
         """A tracker that runs a model file or, by its name, a bundled model (`model.bundled`), for
         whoever a calibration file describes; with `alignment` fingers are turned towards their
-        markers, which takes half as long again; without `gate` every measurement is believed.
+        markers, which takes half as long again; without `gate` every measurement is believed; with
+        `smoothing` what is given out jitters less and lags more, see `one_euro`.
 
         Raises:
             ValueError: a file is not what it should be, or damaged; see `model.load` and
                 `wearer.load`.
         """
-        model = replace(load(path), alignment=alignment, gate=gate)
+        model = replace(load(path), alignment=alignment, gate=gate, smoothing=smoothing)
         if calibration is not None:
             model = wearer.calibrated(model, wearer.load(calibration))
         return cls(model, right=right)

@@ -98,7 +98,7 @@ def test_the_laws_can_fail() -> None:
     worst = fuzz.Worst()
     fuzz.check(state, pose, worst)
     for bad_state, bad_pose, message in (
-        (state._replace(age=spoiled(state.age, np.inf)), pose, "state.age of hand 2"),
+        (state._replace(drift=spoiled(state.drift, np.inf)), pose, "state.drift of hand 2"),
         (state, pose._replace(markers=spoiled(pose.markers, np.nan)), "pose.markers of hand 2"),
         (state, pose._replace(expected_error=spoiled(pose.expected_error, -1)), "is negative"),
         (state._replace(rotation=spoiled(state.rotation, 1.01)), pose, "no rotation"),

@@ -22,7 +22,7 @@ ROOT = Path(numpy_infer.__file__).resolve().parents[1]
 
 TWINS = (
     *("geometry", "skeleton", "networks", "predictors", "joints", "output", "gate", "continuity"),
-    "tracker",
+    *("one_euro", "tracker"),
 )
 
 ONE_SIDED = {

@@ -33,6 +33,8 @@ def model() -> Model:
         fade=0.1 + 0.2,  # no short decimal
         continuity=False,
         expected_error=table,
+        marker_error=np.linspace(0.1, 2, 9),
+        faded_error=0.2 + 0.1,
         training={"data": ["a", "b"], "loss": 1 / 3, "seed": 0, "note": "Knöchel", "none": None},
     )
 
@@ -47,7 +49,7 @@ def assert_same(one: Model, other: Model) -> None:
     """Every field, bit for bit."""
     assert one.hand.to_json() == other.hand.to_json()
     assert one.hand.template.tobytes() == other.hand.template.tobytes()
-    for field in ("predictor", "joints", "fade", "continuity", "training"):
+    for field in ("predictor", "joints", "fade", "faded_error", "continuity", "training"):
         assert getattr(one, field) == getattr(other, field)
         assert type(getattr(one, field)) is type(getattr(other, field))
     for name in ("marker_network", "joint_network"):
@@ -60,6 +62,7 @@ def assert_same(one: Model, other: Model) -> None:
                 pair = {0: getattr(mine, part.name)}, {0: getattr(theirs, part.name)}
                 assert_same_arrays(*pair)
     assert_same_arrays({0: np.asarray(one.expected_error)}, {0: other.expected_error})
+    assert_same_arrays({0: one.error_factors}, {0: other.error_factors})
 
 
 def assert_same_arrays(one: Any, other: Any) -> None:
@@ -148,6 +151,11 @@ def test_a_model_appears_whole_or_not_at_all(
         ({"expected_error": np.zeros((4, 5))}, "expected_error"),
         ({"expected_error": np.full((4, 6), np.nan)}, "expected_error"),
         ({"expected_error": np.zeros((0, 6))}, "expected_error"),
+        ({"marker_error": np.ones(8)}, "marker_error"),
+        ({"marker_error": np.full(9, np.nan)}, "marker_error"),
+        ({"marker_error": np.full(9, -1.0)}, "marker_error"),
+        ({"faded_error": -0.5}, "'faded_error' must not be negative"),
+        ({"faded_error": float("inf")}, "JSON compliant"),
     ],
 )
 def test_what_could_not_be_read_back_is_not_written(
@@ -293,8 +301,10 @@ REFUSED: dict[str, tuple[Callable[[dict[str, bytes]], Any], str]] = {
     "no npy": (lambda m: m.update({BIAS: b"bias"}), ""),
     "empty part": (lambda m: m.update({BIAS: b""}), ""),
     "table of no rows": (put("expected_error.npy", np.zeros((0, 6))), "expected_error"),
-    "table of other ages": (put("expected_error.npy", np.zeros((4, 5))), "expected_error"),
+    "table of other changes": (put("expected_error.npy", np.zeros((4, 5))), "expected_error"),
     "table of NaN": (put("expected_error.npy", np.full((4, 6), np.nan)), "expected_error"),
+    "a factor too few": (put("marker_error.npy", np.ones(8)), "marker_error"),
+    "a negative factor": (put("marker_error.npy", np.full(9, -1.0)), "marker_error"),
 }
 
 

@@ -105,4 +105,5 @@ def test_in_jax_too() -> None:
     assert_same(ran[1].markers, stepped[1].markers, 1e-6)
     ours = tracker.run(model, tracker.init(model, (2,), right), markers, visible, dt)
     assert_allclose(ran[1].markers, ours[1].markers, rtol=0, atol=1e-4)
-    assert_allclose(ran[0].age, ours[0].age, rtol=0, atol=1e-4)
+    assert_allclose(ran[0].drift, ours[0].drift, rtol=0, atol=1e-4)
+    assert_allclose(ran[1].expected_error, ours[1].expected_error, rtol=0, atol=1e-4)

@@ -175,8 +175,9 @@ def test_in_no_time_nothing_that_runs_on_time_moves(
     assert (pose.notice & Notice.NON_POSITIVE_DT).all()
     _, same = run(model, elsewhere._replace(dt=np.zeros((1, 3))), state=state)
     assert_same_bits(after, same)
-    # Ages stand still, and the correction of a re-entered marker is as large as it was.
-    assert_array_equal(after.age, state.age)
+    # The drift of hidden markers stands still, and the correction of a re-entered one is as large
+    # as it was.
+    assert_array_equal(after.drift, state.drift)
     length = np.linalg.norm(state.correction, axis=-1)
     assert_array_equal(np.linalg.norm(after.correction, axis=-1), length)
     if case.predictor == "moving_average":

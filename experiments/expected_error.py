@@ -1,0 +1,77 @@
+"""Whether `expected_error` tells the truth: `python experiments/expected_error.py glove9
+manipnet:../shared/data/manipnet`.
+
+Gaps like real ones are put into the test takes; whatever is hidden is sorted by what the tracker
+expects it to be off, and beside that stands what it was off. `--measured` first measures the
+errors anew on the data's validation takes: what a model trained on these data would say.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from jaxhand import datasets
+from jaxhand.expected_error import Samples, measure, people
+from jaxhand.export import with_expected_error
+from jaxhand.sequences import Sequence as MarkerSequence
+from jaxhand.training_data import SIMULATED
+from numpy_infer.hand import Hand
+from numpy_infer.model import load
+
+EDGES = (0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32, 40, np.inf)
+"""Millimetres: the bins."""
+FEWEST, WITHIN = 500, 0.15
+"""What is promised: in bins of so many samples the means agree within this part of the measured."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("model", help="a model file or a bundled model")
+    parser.add_argument("data", help=f"NAME:PATH, or the word {SIMULATED}")
+    parser.add_argument("--split", choices=("validation", "test"), default="test")
+    parser.add_argument("--measured", action="store_true", help="measure on validation first")
+    options = parser.parse_args()
+    model = replace(load(options.model), predictor="learned", joints="none")
+    if options.measured:
+        model = with_expected_error(model, takes(options.data, "validation", model.hand))
+    show(measure(model, takes(options.data, options.split, model.hand), seed=1))
+
+
+def takes(spec: str, split: datasets.Split, hand: Hand) -> Sequence[MarkerSequence]:
+    """Of a data set; or of simulated people, other ones for the test."""
+    if spec == SIMULATED:
+        return people(hand, seed=1 if split == "validation" else 2)
+    return datasets.load(spec, split, hand=hand).sequences
+
+
+def show(samples: Samples) -> None:
+    """Prints the bins."""
+    expected, measured = 1e3 * samples.expected, 1e3 * samples.measured
+    place = np.digitize(expected, EDGES) - 1
+    print("expected, mm      mean  measured  ratio  samples")
+    missed = counted = 0
+    for i in np.unique(place):
+        inside = place == i
+        means = expected[inside].mean(), measured[inside].mean()
+        off = means[0] / means[1]
+        if inside.sum() >= FEWEST:
+            counted += 1
+            missed += abs(off - 1) > WITHIN
+        span = f"{EDGES[i]:g} to {EDGES[i + 1]:g}"
+        print(f"{span:14}{means[0]:8.2f}{means[1]:10.2f}{off:7.2f}{inside.sum():9}")
+    print(
+        f"{'all':14}{expected.mean():8.2f}{measured.mean():10.2f}"
+        f"{expected.mean() / measured.mean():7.2f}{len(expected):9}"
+    )
+    print(
+        f"correlation {np.corrcoef(expected, measured)[0, 1]:.2f}; "
+        f"{missed} of {counted} bins are more than {WITHIN:.0%} off"
+    )
+
+
+if __name__ == "__main__":
+    main()

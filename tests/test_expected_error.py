@@ -1,0 +1,95 @@
+"""What error to expect: 0 where observed, no more while the posture stays, and fitted in sums."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from streams import a_model, motion, moved, paths, seeds
+
+from numpy_infer import tracker
+from numpy_infer.model import ERROR_CHANGES
+
+Array = np.ndarray
+
+TABLE = np.array([[0.001, 0.002, 0.003, 0.004, 0.005, 0.006]] * 2) * [[1], [2]]
+
+
+@given(seeds())
+def test_a_posture_that_stays_expects_no_more_error_however_long(seed: int) -> None:
+    factors = np.linspace(0.5, 2, 9)
+    model = a_model(
+        "learned", expected_error=TABLE, marker_error=factors, faded_error=0.5, seed=seed
+    )
+    rng = np.random.default_rng(seed)
+    markers = moved(motion(model.hand, rng, 1, 1)[0], *paths(rng, 30, 1))
+    hidden = rng.permutation(9) < rng.integers(1, 4)
+    visible = np.broadcast_to(~hidden, (30, 1, 9)).copy()
+    visible[:5] = True
+    state = tracker.init(model, (1,))
+    _, pose = tracker.run(model, state, markers, visible, np.full((30, 1), 1 / 60))
+    assert not pose.expected_error[:5].any()
+    expected = np.where(hidden, TABLE[min(hidden.sum(), 2) - 1, 0] * factors, 0)
+    np.testing.assert_allclose(pose.expected_error[5:, 0] - expected, 0, atol=1e-6)
+
+
+def test_it_grows_as_the_posture_goes_on_and_with_what_the_correction_has_lost() -> None:
+    model = a_model("learned", expected_error=TABLE, faded_error=0.5)
+    rng = np.random.default_rng(0)
+    markers = motion(model.hand, rng, 40, 1)
+    visible = np.ones((40, 1, 9), bool)
+    visible[5:, :, [3, 6]] = False
+    visible[20:, :, 7] = False  # another set: what was gone before is not forgotten
+    state = tracker.init(model, (1,))
+    for points, seen in zip(markers, visible, strict=True):
+        state, pose = tracker.step(model, state, points, seen, np.full(1, 1 / 60))
+        hidden = ~seen[0]
+        gone = state.drift[0] + state.change
+        row = TABLE[min(max(hidden.sum(), 1), 2) - 1]
+        lost = np.linalg.norm(state.correction[0], axis=-1) * (1 - np.exp(-state.change / 0.03))
+        expected = np.interp(gone, ERROR_CHANGES, row) + 0.5 * lost
+        np.testing.assert_allclose(pose.expected_error[0], np.where(hidden, expected, 0), atol=1e-9)
+    assert state.drift[0, 3] > 0.001
+    assert state.drift[0, 7] == 0
+    assert state.change > 0.001
+
+
+def some_samples(seed: int) -> tuple[object, Array]:
+    """Samples whose errors scatter about known means, and these."""
+    from jaxhand.expected_error import Samples
+
+    rng = np.random.default_rng(seed)
+    count = 20_000
+    number, marker = rng.integers(1, 9, count), rng.integers(0, 9, count)
+    change, faded = rng.gamma(1, 0.005, count), rng.gamma(1, 0.002, count)
+    rows, factors = np.array([1, 1.1, 1.3, 1.5, 2, 3]), np.linspace(0.5, 1.5, 9)
+    table = np.interp(change, ERROR_CHANGES, TABLE[0])
+    means = rows[np.minimum(number, 6) - 1] * factors[marker] * table + 0.7 * faded
+    measured = means * rng.gamma(2, 0.5, count)
+    return Samples(number, marker, change, faded, means, measured), means
+
+
+def test_what_is_fitted_is_what_the_errors_were_drawn_from() -> None:
+    pytest.importorskip("jax")
+    from jaxhand.expected_error import fit
+
+    samples, _ = some_samples(0)
+    found = fit(samples, 9)
+    np.testing.assert_allclose(found.marker_error, np.linspace(0.5, 1.5, 9), rtol=0.1)
+    np.testing.assert_allclose(found.faded_error, 0.7, rtol=0.1)
+    np.testing.assert_allclose(found.expected_error[0], TABLE[0], rtol=0.15)
+    assert (np.diff(found.expected_error) >= 0).all()
+
+
+def test_a_number_never_hidden_is_as_the_next_smaller_and_a_marker_as_the_mean() -> None:
+    pytest.importorskip("jax")
+    from jaxhand.expected_error import fit
+
+    samples, _ = some_samples(1)
+    there = (samples.marker != 4) & (samples.number < 4)
+    found = fit(type(samples)(*(field[there] for field in samples)), 9)
+    assert np.isfinite(found.expected_error).all()
+    np.testing.assert_array_equal(found.expected_error[3:], found.expected_error[[2, 2, 2]])
+    assert (found.expected_error[2] > found.expected_error[0]).all()
+    assert np.isfinite(found.marker_error).all()
+    assert found.marker_error[4] == pytest.approx(1, abs=0.1)
