@@ -110,6 +110,7 @@ def print_tracking(model: Model, rounds: int) -> None:
         "its two networks alone: the unit": unit,
         "one hand, one marker hidden": track(None, lambda i: [4][: i > 0], **aligned),
         "  without finger alignment": track(None, lambda i: [4][: i > 0]),
+        "  with the gate": track(None, lambda i: [4][: i > 0], gate=True, **aligned),
         "  nothing hidden": track(None, lambda i: [], **aligned),
         "  another marker hidden each frame": track(None, lambda i: [4 + i % 4], **aligned),
         "two hands": track(2, lambda i: [4][: i > 0], **aligned),
