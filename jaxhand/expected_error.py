@@ -8,7 +8,7 @@ fits worse are told so.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ import numpy as np
 from jaxhand import anthropometry, motion, simulation
 from jaxhand import sequences as data
 from jaxhand.contact import marked
+from jaxhand.motion import Motion
 from numpy_infer import tracker
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
@@ -42,15 +43,22 @@ PEOPLE, SECONDS = 64, 10
 """Of simulated sequences to measure on."""
 
 
-def people(hand: Hand, seed: int) -> list[data.Sequence]:
-    """Simulated people in motion, each with bones of their own and markers not quite in place."""
+def people(
+    hand: Hand,
+    seed: int,
+    count: int = PEOPLE,
+    seconds: float = SECONDS,
+    moves: Callable[..., Motion] = motion.motion,
+) -> list[data.Sequence]:
+    """Simulated people in motion, each with bones of their own and markers not quite in place.
+    `moves` is called as `motion.motion`."""
 
     @jax.jit
     def run(key: Array) -> Array:
-        who, place, moves = jax.random.split(key, 3)
-        group = anthropometry.people(who, hand, (PEOPLE,))
+        who, place, move = jax.random.split(key, 3)
+        group = anthropometry.people(who, hand, (count,))
         offsets = anthropometry.placed(place, hand, group)[:, None]
-        there = motion.motion(moves, round(SECONDS * data.RATE), data.RATE, (PEOPLE,), group)
+        there = moves(move, round(seconds * data.RATE), data.RATE, (count,), group)
         return marked(replace(hand, offsets=offsets), group.skeleton[:, None], *there)[0]
 
     found = np.asarray(run(jax.random.key(seed)))

@@ -184,11 +184,12 @@ def test_a_rigid_motion_of_the_markers_moves_the_wrist_alone(motion: tuple[Array
     seen = np.where(visible[..., None], markers, np.nan)
     seen[:5, 2:] = seen[60:70, 2:] = seen[100:110] = np.nan
     aligned = np.isfinite(seen[:, list(hand.alignment)]).all((-1, -2))
-    # Two markers leave the turn about their line to the frame before, by way of a prior which is
-    # that much weaker than they are: float32's rounding counts as often, and adds up.
+    # Two markers leave the turn about their line to the frame before, by way of a prior that is a
+    # few thousand times weaker than they are: float32's rounding counts that often, and adds up.
     frame = np.arange(len(seen))
     since = frame - np.maximum.accumulate(np.where(aligned, frame, -1))
-    rounding = np.finfo(np.float32).eps / 2 * 1e-3 / PRIOR_STRENGTH
+    size = ((hand.template[0] - hand.template[1]) ** 2).sum() / 2
+    rounding = np.finfo(np.float32).eps / 2 * size / PRIOR_STRENGTH
     for method in METHODS.values():
         here = method(hand, glove, seen, 1 / RATE)
         there = method(hand, glove, seen @ rotation.T + translation, 1 / RATE)
