@@ -90,12 +90,6 @@ def print_tracking(model: Model, rounds: int) -> None:
     hand = model.hand
     streams = simulation.streams(jax.random.key(2), hand, 4, rounds + 1)
     markers = np.array(np.swapaxes(streams.markers, 0, 1), np.float64)
-    features = np.zeros(3 * len(hand), np.float32)
-
-    def unit() -> None:
-        for network in (model.marker_network, model.joint_network):
-            assert network is not None
-            plain(network, features)
 
     def track(hands: int | None, hidden: Callable[[int], list[int]], **changes: Any) -> Any:
         tracker = HandTracker(replace(model, **changes), right=[False] * hands if hands else False)
@@ -107,7 +101,7 @@ def print_tracking(model: Model, rounds: int) -> None:
 
     aligned = {"alignment": True}
     runs = {
-        "its two networks alone: the unit": unit,
+        "its two networks alone: the unit": unit_of(model),
         "one hand, one marker hidden": track(None, lambda i: [4][: i > 0], **aligned),
         "  without finger alignment": track(None, lambda i: [4][: i > 0]),
         "  with the gate": track(None, lambda i: [4][: i > 0], gate=True, **aligned),
@@ -124,6 +118,37 @@ def print_tracking(model: Model, rounds: int) -> None:
         print(
             f"  {name:36} {spread(1e6 * seconds, 0):18} {spread(seconds / first, 1):18} {tail:.2f}"
         )
+
+
+def print_alone(model: Model, rounds: int) -> None:
+    """The unit and the pipeline, each in a loop of its own, with all of the cache."""
+    streams = simulation.streams(jax.random.key(2), model.hand, 1, rounds + 1)
+    frames = np.array(streams.markers[0], np.float64)
+    frames[1:, 4] = np.nan
+    tracker, ahead = HandTracker(replace(model, alignment=True)), iter(frames)
+
+    def step() -> None:
+        tracker.step(next(ahead), 1 / 60)
+
+    print("\neach in a loop of its own, µs a frame")
+    medians = []
+    for name, run in (("unit", unit_of(model)), ("one hand", step)):
+        taken = 1e6 * interleaved({name: run}, rounds)[name]
+        medians.append(np.median(taken))
+        print(f"  {name:28} {spread(taken, 0)}")
+    print(f"  {'ratio':28} {medians[1] / medians[0]:.1f}")
+
+
+def unit_of(model: Model) -> Callable[[], None]:
+    """The plain forward pass of a model's two networks, of one frame."""
+    features = np.zeros(3 * len(model.hand), np.float32)
+
+    def unit() -> None:
+        for network in (model.marker_network, model.joint_network):
+            assert network is not None
+            plain(network, features)
+
+    return unit
 
 
 def plain(network: Network, inputs: Array) -> Array:
@@ -224,6 +249,7 @@ def main() -> None:
     options = parser.parse_args()
     model = print_training(options.rounds)
     print_tracking(model, options.frames)
+    print_alone(model, options.frames)
     print_offline(model, options.rounds)
     print_joints(model, options.rounds)
     print_simulator(min(options.rounds, 5))

@@ -101,7 +101,7 @@ def parser() -> argparse.ArgumentParser:
     tracked.add_argument(
         "--right-prefix",
         metavar="P",
-        help="the same of a right hand; with both, two hands are tracked at once and written to "
+        help="the same of a right hand; with both, either hand is tracked and written to "
         "OUT_left and OUT_right",
     )
     tracked.add_argument(
