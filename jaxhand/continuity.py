@@ -27,7 +27,7 @@ from jaxhand.geometry import (
     untransform,
 )
 from jaxhand.output import leading, wrist_pose
-from jaxhand.predictors import PREDICTORS, learned_step, predicted_markers
+from jaxhand.predictors import PREDICTORS
 from numpy_infer.arrays import Array
 from numpy_infer.continuity import (
     DRIFT_UNSEEN,
@@ -170,15 +170,16 @@ def _fill(
     registration: tuple[Array, Array],
     before: tuple[Array, Array],
 ) -> tuple[Any, Array]:
-    """One step of the model's predictor; the learned one is spared a second registration.
+    """One step of the model's predictor; one that looks at this frame alone is spared a second
+    registration.
 
     What a predictor that goes by the frame has nothing to say of moves with the hand: from the
     registration `before`, of the previous frame by the same markers, to that of this frame.
     """
     chosen = PREDICTORS[model.predictor]
-    if chosen.step is learned_step:
-        predicted = predicted_markers(model, untransform(*registration, markers), visible)
-        moved = transform(*registration, predicted)
+    if chosen.of_frame is not None:
+        said = chosen.of_frame(model, untransform(*registration, markers), visible)
+        moved = transform(*registration, said)
         return predictor, jnp.where(visible[..., None], markers, moved)
     if chosen.uses_frame:
         last = transform(*registration, untransform(*before, last))

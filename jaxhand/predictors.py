@@ -15,6 +15,8 @@ makes them continuous. Without it a predictor starts from its own last output, a
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 
 from jaxhand.geometry import apart, centre, inner, kabsch, product, solve, transform, untransform
@@ -164,32 +166,45 @@ def affine_combination(frame: Array, weight: Array, markers: Array) -> tuple[Arr
     return now_mean + inner(now, shares)[..., 0], weight.any(-1)
 
 
-def learned_init(model: Model, batch: tuple[int, ...] = ()) -> tuple[()]:
-    """The network looks at one frame and remembers nothing."""
-    return ()
+def by_frame(of_frame: Callable[[Model, Array, Array], Array]) -> Predictor:
+    """A predictor that looks at one frame, remembers nothing, and is asked for many at once.
 
+    Args:
+        of_frame: what it says of all markers, `[..., M, 3]` metres, registered frame; of the model,
+            the markers `[..., M, 3]` metres in that frame, of which hidden ones mean nothing, and
+            `visible`, which broadcasts to `[..., M]`.
+    """
 
-def learned_step(
-    model: Model,
-    state: tuple[()],
-    markers: Array,
-    visible: Array,
-    last: Array,
-    dt: Array,
-) -> tuple[tuple[()], Array]:
-    """Marker regressor (paper, section 3.2.2): the visible markers, registered to the template, go
-    through the network, hidden ones entering as 0; what it says of hidden ones is moved back."""
-    template = jnp.asarray(model.hand.template, markers.dtype)
-    measured = jnp.where(visible[..., None], markers, 0)
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=markers.dtype), (*visible.shape[:-1], 3, 3))
-    registration = kabsch(template, measured, visible.astype(markers.dtype), eye)
-    predicted = predicted_markers(model, untransform(*registration, measured), visible)
-    return state, jnp.where(visible[..., None], markers, transform(*registration, predicted))
+    def step(
+        model: Model,
+        state: tuple[()],
+        markers: Array,
+        visible: Array,
+        last: Array,
+        dt: Array,
+    ) -> tuple[tuple[()], Array]:
+        template = jnp.asarray(model.hand.template, markers.dtype)
+        measured = jnp.where(visible[..., None], markers, 0)
+        eye = jnp.broadcast_to(jnp.eye(3, dtype=markers.dtype), (*visible.shape[:-1], 3, 3))
+        registration = kabsch(template, measured, visible.astype(markers.dtype), eye)
+        said = of_frame(model, untransform(*registration, measured), visible)
+        return state, jnp.where(visible[..., None], markers, transform(*registration, said))
+
+    return Predictor(none_init, step, uses_frame=True, of_frame=of_frame)
 
 
 def predicted_markers(model: Model, registered: Array, visible: Array) -> Array:
-    """`[..., M, 3]` metres, registered frame: what the marker network says of all markers, given
-    those `visible [..., M]` of `registered [..., M, 3]`."""
+    """Marker regressor (paper, section 3.2.2): the visible markers, registered to the template, go
+    through the network, hidden ones entering as 0.
+
+    Args:
+        model: its marker network is run.
+        registered: `[..., M, 3]` metres, registered frame.
+        visible: `[..., M]`.
+
+    Returns:
+        `[..., M, 3]` metres, registered frame: what it says of all markers.
+    """
     network: Network = model.marker_network  # type: ignore[assignment]
     features = registered.reshape(*registered.shape[:-2], -1)
     known = jnp.repeat(visible, 3, -1)
@@ -212,6 +227,6 @@ PREDICTORS: dict[str, Predictor] = {
     "last_known": Predictor(last_known_init, last_known_step, uses_frame=False),
     "moving_average": Predictor(moving_average_init, moving_average_step, uses_frame=False),
     "affine": Predictor(affine_init, affine_step, uses_frame=True),
-    "learned": Predictor(learned_init, learned_step, uses_frame=True),
+    "learned": by_frame(predicted_markers),
     "none": Predictor(none_init, none_step, uses_frame=False),
 }

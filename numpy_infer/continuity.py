@@ -29,7 +29,7 @@ from numpy_infer.geometry import (
 from numpy_infer.model import Model
 from numpy_infer.output import leading, wrist_pose
 from numpy_infer.pose import DETERMINED_EXTENT, State
-from numpy_infer.predictors import PREDICTORS, learned_step, predicted_markers
+from numpy_infer.predictors import PREDICTORS
 
 SHRINK_SPEED = 0.25
 """m/s at which the correction of a visible marker dies (paper, section 3.2.2)."""
@@ -249,7 +249,7 @@ def _unsteady(
     last = np.where(tracked, state.output, placed)
 
     measured = untransform(rotations, translations, np.stack([markers, previous]))
-    if PREDICTORS[model.predictor].step is learned_step:
+    if PREDICTORS[model.predictor].of_frame is not None:
         # Both frames in one product per layer of the network.
         advance, both, raw, exact = _fill(
             model, state.predictor, measured, markers, visible, last, dt, now, now
@@ -316,7 +316,8 @@ def _fill(
     registration: tuple[Array, Array],
     before: tuple[Array, Array],
 ) -> tuple[Any, Array, Array, Array]:
-    """One step of the model's predictor; the learned one is spared a second registration.
+    """One step of the model's predictor; one that looks at this frame alone is spared a second
+    registration.
 
     What a predictor that goes by the frame has nothing to say of moves with the hand: from the
     registration `before`, of the previous frame by the same markers, to that of this frame.
@@ -325,10 +326,10 @@ def _fill(
         The predictor's next state, and `registered`, `raw` and `exact` as in `_Frame`.
     """
     chosen = PREDICTORS[model.predictor]
-    if chosen.step is learned_step:
+    if chosen.of_frame is not None:
         if not visible.all():
-            predicted = predicted_markers(model, registered, visible)
-            registered = np.where(visible[..., None], registered, predicted)
+            said = chosen.of_frame(model, registered, visible)
+            registered = np.where(visible[..., None], registered, said)
         return predictor, registered, markers, visible
     if chosen.uses_frame:
         last = transform(*registration, untransform(*before, last))

@@ -246,6 +246,19 @@ def quietly(state: GateState, markers: Array, visible: Array, dt: Array) -> Gate
     return last._replace(restless=state.restless / fade, age=age)
 
 
+def restless(markers: Array, visible: Array, dt: Array) -> Array:
+    """`[T]` True where frames `[T, ..., M, 3]` look as if one will not be quiet: `quietly` is best
+    asked of those between. The first two always do."""
+    moved = np.diff(markers, axis=0)
+    velocity = moved[:-1] / np.maximum(dt[1:-1], BRIEFEST)[..., None, None]
+    told = (moved[1:] != 0).sum((-1, -2)) == 3 * visible[2:].sum(-1)
+    alike = (visible[2:] == visible[1:-1]).all(-1)
+    quiet = told & alike & (_off(moved[1:], velocity, dt[2:]).max(-1) < QUIET**2)
+    found = np.ones(len(markers), bool)
+    found[2:] = ~quiet.all(tuple(range(1, quiet.ndim)))
+    return found
+
+
 def _off(moved: Array, velocity: Array, dt: Array) -> Array:
     """`[..., M]` m²: the square of how far markers left their uniform motion, beside the others."""
     off = moved - velocity * dt[..., None, None]
@@ -308,14 +321,17 @@ def _carefully(
     frozen, same = _frozen(known, state, markers, visible)
     wrong = suspect | swapped | frozen | (same & ~state.accepted & ~excused)
     entering = visible & ~state.followed & ~excused
-    wrong = wrong | (entering & _impossible(known, markers, visible & ~wrong))
+    if np.count_nonzero(entering):
+        wrong = wrong | (entering & _impossible(known, markers, visible & ~wrong))
 
-    # Where most of a frame is wrong, or what is left would not do, it is the gate that is wrong.
-    left = visible & ~wrong
-    enough = _spread(markers, left) | ~_spread(markers, visible)
-    believed = (2 * left.sum(-1) >= visible.sum(-1)) & enough
-    wrong = wrong & believed[..., None]
-    swapped = swapped & believed[..., None]
+    if np.count_nonzero(wrong):
+        # Where most of a frame is wrong, or what is left would not do, it is the gate that is
+        # wrong.
+        left = visible & ~wrong
+        enough = _spread(markers, left) | ~_spread(markers, visible)
+        believed = (2 * left.sum(-1) >= visible.sum(-1)) & enough
+        wrong = wrong & believed[..., None]
+        swapped = swapped & believed[..., None]
     accepted = visible & ~wrong
     followed = accepted | swapped
     own = np.take_along_axis(markers, order[..., None], -2)
@@ -384,6 +400,9 @@ def _least(off: Array) -> Array:
 def _labels(known: Reach, placed: Array, markers: Array, off: Array, fresh: Array) -> Array:
     """`[..., M]` the label under which each marker is measured: its own, or a neighbour's."""
     order = np.broadcast_to(np.arange(markers.shape[-2]), fresh.shape)
+    # One of two that are swapped is at least half as far off as both.
+    if not np.count_nonzero(fresh & (off > SWAP_LEAST / 2)):
+        return order
     for (one, other), partner in zip(known.neighbours, known.partner, strict=True):
         crossed = _least(placed[..., one, :] - markers[..., other, :])
         crossed_back = _least(placed[..., other, :] - markers[..., one, :])
@@ -400,6 +419,8 @@ def _frozen(known: Reach, state: GateState, markers: Array, visible: Array) -> t
     again = visible & state.visible
     moved = markers - state.markers
     same = again & (moved == 0).all(-1)
+    if not np.count_nonzero(same):
+        return same, same
     moving = again & ((moved * moved).sum(-1) > MOVED**2)
     return same & ((known.carriers & moving[..., None, :]).sum(-1) >= 2), same
 

@@ -23,7 +23,7 @@ from numpy_infer.model import ERROR_CHANGES, Model, load
 from numpy_infer.one_euro import Filter, Smoothing
 from numpy_infer.output import hand_pose, smoothed, wrist_pose
 from numpy_infer.pose import HandPose, State
-from numpy_infer.predictors import PREDICTORS, learned_step
+from numpy_infer.predictors import PREDICTORS
 
 FARTHEST = 1e5
 """Metres: no coordinate is larger; one that is would overflow where it is squared."""
@@ -122,10 +122,12 @@ def run(
         for leaf in (getattr(state, name),)
     }
     begins = np.ones(count, bool)
-    if PREDICTORS[model.predictor].step is learned_step:  # it alone remembers nothing
+    if PREDICTORS[model.predictor].of_frame is not None:
         alone = late.any(tuple(range(1, late.ndim)))
         begins[1:] = (visible[1:] != visible[:-1]).any(tuple(range(1, visible.ndim)))
         begins[1:] |= alone[1:] | alone[:-1]
+        if model.gate:
+            begins |= gate.restless(markers, visible, elapsed)
     starts = [*np.flatnonzero(begins), count]
     for start, end in pairwise(starts):
         done = start

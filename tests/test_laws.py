@@ -36,7 +36,14 @@ from jaxhand.trial import extents
 from numpy_infer.hand import hand_from_json, load_hand
 from numpy_infer.model import Model
 from numpy_infer.pose import DETERMINED_EXTENT
-from numpy_infer.predictors import PREDICTORS, Predictor, affine_init, affine_step, none_init
+from numpy_infer.predictors import (
+    PREDICTORS,
+    Predictor,
+    affine_init,
+    affine_step,
+    by_frame,
+    none_init,
+)
 
 Array = np.ndarray
 
@@ -226,14 +233,22 @@ def test_a_predictor_of_one_s_own_is_checked_by_its_name() -> None:
     ) -> tuple[Any, Array]:
         return state, np.where(visible[..., None], markers, last + 1e-3)
 
+    def shrunk(model: Model, registered: Array, visible: Array) -> Array:
+        visible = np.broadcast_to(visible, registered.shape[:-1])[..., None]
+        seen = np.where(visible, registered - model.hand.template, 0)
+        return model.hand.template + seen.sum(-2, keepdims=True) / visible.shape[-2]
+
     PREDICTORS["good"] = Predictor(affine_init, affine_step, uses_frame=True)
+    PREDICTORS["by its frame"] = by_frame(shrunk)
     PREDICTORS["drifting"] = Predictor(none_init, step, uses_frame=False)
     try:
-        laws.check_all(laws.tracker(Model(GLOVE, "good")), examples=1, frames=8)
+        for name in ("good", "by its frame"):
+            laws.check_all(laws.tracker(Model(GLOVE, name)), examples=1, frames=8)
         with pytest.raises(AssertionError, match=r"law '\w+': marker "):
             laws.check_all(laws.tracker(Model(GLOVE, "drifting")), laws=["rigid"], frames=8)
     finally:
-        del PREDICTORS["good"], PREDICTORS["drifting"]
+        for name in ("good", "by its frame", "drifting"):
+            del PREDICTORS[name]
 
 
 def test_an_unknown_law_is_refused() -> None:

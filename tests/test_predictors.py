@@ -32,7 +32,7 @@ def play(
 ) -> tuple[Array, object]:
     """`[T, M, 3]` what is filled in, frame by frame, with its own output as the last one."""
     model = a_model(predictor)
-    init, step, _ = PREDICTORS[predictor]
+    init, step, *_ = PREDICTORS[predictor]
     state, last = init(model), model.hand.template
     filled = []
     for measured, shown, elapsed in zip(
@@ -65,7 +65,7 @@ def test_visible_markers_are_passed_through_bit_for_bit_and_the_rest_is_finite(
 @given(seed=seeds())
 def test_a_marker_never_seen_stays_where_the_output_has_it(predictor: str, seed: int) -> None:
     model = a_model(predictor)
-    init, step, _ = PREDICTORS[predictor]
+    init, step, *_ = PREDICTORS[predictor]
     rng = np.random.default_rng(seed)
     state, visible = init(model), np.arange(9) < 5
     for _ in range(4):

@@ -66,7 +66,8 @@ def test_the_python_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         for name in suite:
             space[name]()  # type: ignore[operator]
     finally:
-        PREDICTORS.pop("mine", None)
+        for name in ("mine", "template"):
+            PREDICTORS.pop(name, None)
     assert np.isfinite(space["pose"].markers).all()  # type: ignore[attr-defined]
     assert blocks("python")
 
