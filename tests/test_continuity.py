@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from cases import FEW, Case, each
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from streams import PATTERNS, motion, seeds
+from numpy.testing import assert_allclose
+from strategies import turn
+from streams import PATTERNS, SPEED, a_model, motion, moved, postures, seeds
 
 from jaxhand import laws
 from jaxhand.strategies import Motion, Stream, rigid_motions
+from jaxhand.trial import run
+from numpy_infer.geometry import kabsch
+from numpy_infer.pose import DETERMINED_EXTENT
 from numpy_infer.predictors import PREDICTORS
 
 
@@ -76,3 +82,43 @@ def test_a_hand_that_was_gone_comes_back_where_it_is_now_and_continuous_in_its_o
     stream = data.draw(case.streams(30, 4, least=3))
     follow = PREDICTORS[case.predictor].uses_frame
     laws.check_return(tracker, stream, motion, all_markers=follow, metres=case.metres)
+
+
+@each
+@settings(max_examples=4)
+@given(seed=seeds(), motion=rigid_motions(1))
+def test_so_does_one_whose_posture_has_changed_meanwhile(
+    case: Case, seed: int, motion: Motion
+) -> None:
+    """What is measured is then taken for the hand's motion as well as it can be."""
+    tracker, gone, dt = case.tracker(), 3, 1 / 60
+    before, after = postures(tracker.hand, np.random.default_rng(seed), 40, 1)[[0, -1]]
+    truth = np.stack([before] * (1 + gone) + [motion(after)])
+    visible = np.ones(truth.shape[:-1], bool)
+    visible[1:-1] = False
+    markers = run(tracker, Stream(truth, visible, np.full(visible.shape[:2], dt))).poses["markers"]
+    eye = np.broadcast_to(np.eye(3), (1, 3, 3))
+    rotation, shift = kabsch(before, truth[-1], np.ones(visible.shape[1:]), eye)
+    steps = np.linalg.norm(markers[-1] - moved(before, rotation, shift), axis=-1)
+    assert steps.max() < SPEED * dt + 2 * case.metres
+
+
+@pytest.mark.parametrize("predictor", [n for n, p in PREDICTORS.items() if p.uses_frame])
+@settings(max_examples=20)
+@given(seed=seeds(), finger=st.sampled_from(["Index", "Middle", "Ring", "Pinky"]))
+def test_a_bent_finger_left_alone_carries_the_hand_with_it(
+    predictor: str, seed: int, finger: str
+) -> None:
+    """Three markers, in one line in the flat hand: what they leave open follows the hand's own
+    motion since the frame before, however fast it turns."""
+    rng, model = np.random.default_rng(seed), a_model(predictor, "dense19")
+    tracker = laws.tracker(model)
+    posture = postures(tracker.hand, rng, 1, 1)[0]
+    rotation, shift = turn(rng.normal(size=3), rng.uniform(0.2, 1)), rng.uniform(-0.1, 0.1, 3)
+    truth = np.stack([posture, moved(posture, rotation, shift)])
+    visible = np.ones(truth.shape[:-1], bool)
+    visible[1] = [marker.startswith(finger) for marker in tracker.hand.markers]
+    found = run(tracker, Stream(truth, visible, np.full((2, 1), 1 / 60))).poses
+    bent = np.linalg.svd(posture[visible[1]] - posture[visible[1]].mean(0), compute_uv=False)[1]
+    assume(bent > 2 * DETERMINED_EXTENT)
+    assert_allclose(found["markers"], truth, rtol=0, atol=1e-6)
