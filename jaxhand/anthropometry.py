@@ -1,11 +1,16 @@
 """People: how long, broad and thick their hands are, and where a marker then sits on the skin.
 
 Sources, each also named where its number stands:
-- FAA: anthropometric survey of Technical Operations personnel, US adults, 5th / 50th / 95th
-  percentile of men and women: hand length 180 / 196 / 212 and 163 / 178 / 193 mm, hand breadth
-  80 / 88 / 96 and 71 / 77 / 84 mm, breadth of the index finger's PIP joint 19 / 21 / 23 and
+- FAA: anthropometric survey of Technical Operations personnel, US adults, 2006 to 2008, 5th / 50th
+  / 95th percentile of men and women: hand length 180 / 196 / 212 and 163 / 178 / 193 mm, hand
+  breadth 80 / 88 / 96 and 71 / 77 / 84 mm, breadth of the index finger's PIP joint 19 / 21 / 23 and
   16 / 18 / 21 mm. Half of our people are women, half are men: means of 187, 82.5 and 19.5 mm, and
-  standard deviations of 7.0, 8.5 and 10 % of them.
+  standard deviations of 7.0, 8.5 and 10 % of them. Not confirmed against the survey's report; the
+  figures of others are near, see the next two.
+- Garrett, AMRL-TR-69-42 and AMRL-TR-69-26 (1970), US Air Force men and women, as cited by others:
+  mean hand length 197 and 179 mm, mean depth of the index finger's PIP joint 19.4 and 16.2 mm.
+- British adults of 19 to 65 years, as cited by others: mean hand breadth of men 85 mm, of women
+  75 mm, with standard deviations of 5 and 4 mm: 8.4 % of both together.
 - Buchholz, Armstrong and Goldstein, Ergonomics 35 (1992): hand length explains 49 to 99 % of the
   variance of a segment's length and 82 to 96 % of how far a knuckle lies from the wrist crease;
   hand breadth explains 30 to 74 % of how far it lies aside.
@@ -37,19 +42,22 @@ FINGER_SPREAD = 0.03
 correlation is then 0.7 over women and men together, without the spread of single bones."""
 DIGIT_SPREAD, BONE_SPREAD = 0.02, 0.03
 """Of one finger's length beside that of the others, and of a bone's length beside its finger's.
-Hand length then explains 75 % of the variance of a segment (Buchholz et al. 1992)."""
+With the spread of the wrist's point, hand length then explains 55 to 66 % of the variance of a
+segment (Buchholz et al. 1992: 49 to 99 %)."""
 KNUCKLE_SPREAD, ARCH_SPREAD = 0.002, 0.003
 """Metres, dorsal and palmar: of where each finger's base lies, and of how far the outer ones lie
 out of the plane of the others: whoever measures takes a flat hand or a hollow one, whose fifth
 metacarpal is flexed, for the hand at rest."""
 WRIST_SPREAD = 0.006
 """Metres along the forearm: of where the wrist's point lies. It is a landmark of whoever measures:
-from the distal crease to the head of the capitate, about which the hand turns, is a centimetre."""
+from the distal crease to the head of the capitate, about which the hand turns, is a centimetre, by
+eye."""
 
 THICKNESS_SPREAD = 0.09
 """Of the logarithm of fingers' thickness (FAA: 10 % for one joint of one finger)."""
 THICKNESS_CORRELATION = 0.6
-"""With hand breadth, which then explains 36 % (Buchholz and Armstrong 1991: 12 to 47 %)."""
+"""With hand breadth, which then explains 36 % of the variance of thickness, and 30 % of that of one
+bone's (Buchholz and Armstrong 1991: 12 to 47 % of a segment's breadth)."""
 PAD_SPREAD = 0.04
 """Of one bone's thickness beside that of the others."""
 
@@ -68,8 +76,8 @@ RADII = dict(
     )
 )
 """Millimetres: mean radius of the capsule around the bone that ends in each point, half of the mean
-of breadth and depth. The index finger's PIP joint is 19.5 mm broad (FAA) and fingers are somewhat
-less deep than broad; the others stand in proportion to it, by eye."""
+of breadth and depth. The index finger's PIP joint is 19.5 mm broad (FAA) and 17.8 mm deep
+(Garrett), so its radius is 9.3 mm; all stand in proportion to it, by eye."""
 
 PLACEMENT = 0.003
 """Metres: standard deviation of where a marker is stuck, in each direction along the skin."""

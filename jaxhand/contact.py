@@ -27,8 +27,8 @@ BONES = POINTS[1:]
 """The 20 capsules, each named for the point in which its bone ends."""
 
 YIELD = 3e-3
-"""Metres that flesh gives way: two pulps pressed together come 2 to 4 mm closer (Serina, Mote and
-Rempel, J. Biomech. 30, 1997). What lies less deep is a touch."""
+"""Metres that flesh gives way, chosen by eye: a finger's pulp is soft up to about 1 N and stiffens
+fast beyond (Serina, Mote and Rempel, J. Biomech. 30, 1997). What lies less deep is a touch."""
 PRESS = 2e-3
 """Metres that pads in touch press into each other, and others may."""
 

@@ -3,7 +3,8 @@
 Casiez, Roussel and Vogel, *1 € Filter*, CHI 2012: one pole, whose cutoff grows with the speed. The
 speed here is the length of a marker's low-passed velocity, not one for each coordinate: so the
 filter does not know how the world's axes lie. The velocity is that of the measurements, as in the
-authors' own program; taken from the last output, as printed in the paper, it would count the lag.
+authors' own program until August 2023; taken from the last output, as printed in the paper and in
+their program since, it would count the lag.
 """
 
 from __future__ import annotations

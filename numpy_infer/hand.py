@@ -84,8 +84,10 @@ ANGLES = (
     *(angle for finger in FINGERS[1:] for angle in _finger_angles(finger)),
 )
 """The 26 joint angles of the canonical left hand: flexion positive towards the palm, abduction
-positive towards the thumb (the thumb's own: palmar, away from the index). Ranges are the active
-ranges of motion of AAOS, *Joint Motion* (1965), and Kapandji, widened to take in passive reach."""
+positive towards the thumb (the thumb's own: palmar, away from the index). Ranges are chosen by eye
+about clinical norms of active motion (AAOS, *Joint Motion*, 1965, flexion: MCP 90°, PIP 100°, DIP
+90°, thumb MCP 50° and IP 80°), most of them widened to take in passive reach; the MCP joints'
+extension is less than the 45° there."""
 
 OPENXR = {
     "wrist": "XR_HAND_JOINT_WRIST_EXT",
