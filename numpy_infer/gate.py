@@ -246,7 +246,7 @@ def quietly(state: GateState, markers: Array, visible: Array, dt: Array) -> Gate
     return last._replace(restless=state.restless / fade, age=age)
 
 
-def restless(markers: Array, visible: Array, dt: Array) -> Array:
+def unquiet(markers: Array, visible: Array, dt: Array) -> Array:
     """`[T]` True where frames `[T, ..., M, 3]` look as if one will not be quiet: `quietly` is best
     asked of those between. The first two always do."""
     moved = np.diff(markers, axis=0)

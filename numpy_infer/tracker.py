@@ -127,7 +127,7 @@ def run(
         begins[1:] = (visible[1:] != visible[:-1]).any(tuple(range(1, visible.ndim)))
         begins[1:] |= alone[1:] | alone[:-1]
         if model.gate:
-            begins |= gate.restless(markers, visible, elapsed)
+            begins |= gate.unquiet(markers, visible, elapsed)
     starts = [*np.flatnonzero(begins), count]
     for start, end in pairwise(starts):
         done = start

@@ -34,7 +34,7 @@ ONE_SIDED = {
     "skeleton": {"align_fingers", "finger_forms", "end_arms"},
     # Many steady frames at once: JAX scans over them.
     "continuity": {"together", "each"},
-    "gate": {"quietly", "reach"},  # and a table that both sides share
+    "gate": {"quietly", "unquiet", "reach"},  # and a table that both sides share
     # The spec and its file format exist once, in numpy; the flax module only beside JAX.
     "networks": {
         *("array_shapes", "read_spec", "write_spec"),
