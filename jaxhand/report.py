@@ -43,6 +43,10 @@ class EvaluationConfig:
     truth: Path | None = None
     """Folder that keeps joint truth fitted to dense markers (SIG18, minutes for each user), which
     Table 4 needs: written if it is not there yet, read if it is."""
+    unit: float | None = None
+    """Metres per unit of `recordings` whose files do not say."""
+    left_handed: bool = False
+    """The coordinates of `recordings` are left-handed."""
     json: Path | None = None
     """Write all figures here."""
     plot: Path | None = None
@@ -77,7 +81,15 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
     model = load_model(str(config.model)) if named else None
     hand = model.hand if model else None
     truth = config.truth or config.table == 4
-    dataset = load(config.data[0], "test", hand=hand, takes=config.test or None, truth=truth)
+    dataset = load(
+        config.data[0],
+        "test",
+        hand=hand,
+        takes=config.test or None,
+        unit=config.unit,
+        left_handed=config.left_handed,
+        truth=truth,
+    )
     for note in dataset.notes:
         console.print(f"[dim]{note}[/dim]")
     if config.model is None:

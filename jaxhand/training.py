@@ -76,6 +76,10 @@ class TrainingConfig:
     truth: Path | None = None
     """Fit joint truth to recordings that hold none but have the markers for it (SIG18,
     minutes for each user), keep it in this folder, and train the joint network on it."""
+    unit: float | None = None
+    """Metres per unit of `recordings` whose files do not say."""
+    left_handed: bool = False
+    """The coordinates of `recordings` are left-handed."""
     marker_layers: Layers = (Dense(200), Dense(150), Dense(200))
     """Hidden layers of the marker network: units with ReLU, dropouts as parts of 1 (200,0.1,200),
     or a JSON file; a linear layer follows."""

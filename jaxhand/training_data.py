@@ -130,7 +130,18 @@ def _load(config: TrainingConfig, split: Split, start: Model | None) -> list[Dat
     takes = config.train if split == "train" else config.validation
     truth = config.truth or False
     recorded = [spec for spec in config.data if parse_spec(spec).name != SIMULATED]
-    datasets = [load(spec, split, hand=hand, takes=takes or None, truth=truth) for spec in recorded]
+    datasets = [
+        load(
+            spec,
+            split,
+            hand=hand,
+            takes=takes or None,
+            unit=config.unit,
+            left_handed=config.left_handed,
+            truth=truth,
+        )
+        for spec in recorded
+    ]
     for dataset in datasets[1:]:
         if dataset.hand.markers != datasets[0].hand.markers:
             raise ValueError(

@@ -11,9 +11,13 @@ import pytest
 
 pytest.importorskip("jax")
 
+from rich.console import Console
+
 from jaxhand import evaluation, report
 from jaxhand.cli import evaluate
 from jaxhand.sequences import Sequence
+from jaxhand.training import TrainingConfig
+from jaxhand.training_data import collect
 from numpy_infer import tracker
 from numpy_infer.hand import load_hand
 from numpy_infer.model import Model
@@ -180,9 +184,29 @@ def test_a_command_writes_its_table_and_its_picture(
     assert (tmp_path / "t3.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_printed_table_holds_the_figures() -> None:
-    from rich.console import Console
+def test_what_files_do_not_say_can_be_said(tmp_path: Path) -> None:
+    """Left-handed millimetres of which the file says nothing, to train on and to test on."""
+    take = tmp_path / "one.csv"
+    markers = wriggling(70, 0).markers
+    time = np.arange(len(markers)) / 60
+    foreign = Recording(HAND.markers, 1e3 * markers * [1, 1, -1], time, 60.0, source="")
+    write(foreign, take)
+    take.write_text(take.read_text().replace("# unit: m\n", ""))
+    of = {"data": (f"recordings:{tmp_path}",), "unit": 1e-3, "left_handed": True}
+    names = {"train": ("one",), "validation": ("one",), "hand": "glove9"}
+    given = collect(TrainingConfig(**of, **names, out=tmp_path / "run"))
+    np.testing.assert_allclose(given.training.markers, markers, atol=1e-6)
+    config = report.EvaluationConfig(**of, test=("one",), model="affine", seeds=1)
+    found = report.evaluate(config, Console(quiet=True))["table3"]["affine"]["2"]["0.1"]
+    sequence = Sequence("one/left", "one", 60.0, markers.astype(np.float32))
+    metres = {"affine": Model(HAND, "affine")}
+    expected = evaluation.table3(metres, [sequence], seeds=1)["affine"]["2"]["0.1"]
+    assert found["mean"] == pytest.approx(expected["mean"], rel=1e-4)
+    with pytest.raises(ValueError, match="unit"):
+        report.evaluate(replace(config, unit=None), Console(quiet=True))
 
+
+def test_the_printed_table_holds_the_figures() -> None:
     cell = {"mean": 0.123, "low": 0.1, "high": 0.2, "n": 9}
     row = {f"{d:.1f}": cell for d in evaluation.DURATIONS}
     table = {name: {str(c): row for c in evaluation.COUNTS} for name in ("affine", "learned")}
