@@ -358,10 +358,11 @@ def _pavllo_points(recording: Recording) -> Array | None:
 
 def _with_angles(hand: Hand, posed: list[_Posed]) -> Dataset:
     """Fits skeleton and angles to joint truth, and places the markers that were not measured."""
-    from jaxhand.fitting import angle_deviation, fit_angles  # not before it is needed: loads jax
+    # Not before they are needed: they load jax.
+    from jaxhand.fitting import angle_deviation, fit_angles, rest_directions
 
     points = np.concatenate([p.points for p in posed])
-    hand = hand.with_skeleton(_skeleton(points))
+    hand = hand.with_skeleton(rest_directions(_skeleton(points), points))
     known = np.isfinite(points).all((-1, -2))
     fit = fit_angles(hand.skeleton, points)
     angles = np.where(known[:, None], fit.angles, np.nan)

@@ -18,7 +18,7 @@ import numpy as np
 from jaxhand.geometry import product, solve
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, POINTS
+from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, PARENTS, POINTS
 from numpy_infer.skeleton import JOINT_AXES
 
 ITERATIONS = 100
@@ -36,6 +36,9 @@ from frame to frame, the thumb's other angles with it; this one costs 0.1 to 0.2
 RANGE_PRIOR = 0.1
 """Radians. The same for the part of an angle outside of its range. It keeps a straight finger whose
 tip lies aside, which hinges cannot express, from being twisted by 70°."""
+
+REST_EVERY, REST_ROUNDS = 10, 2
+"""Frames of a recording that the rest directions of its bones are taken from, and how often."""
 
 _OF_FINGER = [[i for i, a in enumerate(ANGLES) if a.joint.startswith(f)] for f in FINGERS]
 _WIDTH = max(map(len, _OF_FINGER))
@@ -92,6 +95,30 @@ def fit_angles(skeleton: Array, points: Array, weight: Array | None = None) -> F
     return FitResult(
         *(np.concatenate(arrays, dtype=np.float32) for arrays in zip(*fitted, strict=True))
     )
+
+
+def rest_directions(skeleton: Array, points: Array) -> Array:
+    """`[21, 3]` metres: the skeleton with every bone beyond a finger's base laid as the joint that
+    carries it has it on average, lengths kept: no hinge is quite square to its bones.
+
+    Args:
+        skeleton: `[21, 3]` metres, each point from its parent in the flat hand.
+        points: `[T, 21, 3]` metres, hand frame; frames with a point that is not finite are left
+            out.
+    """
+    points = np.asarray(points, np.float32)
+    points = points[np.isfinite(points).all((-1, -2))][::REST_EVERY]
+    carried = [i for i, parent in enumerate(PARENTS) if parent > 0]
+    carriers = [PARENTS[i] for i in carried]
+    bones = points[:, carried] - points[:, carriers]
+    laid = np.array(skeleton)
+    for _ in range(REST_ROUNDS if len(points) else 0):
+        turns = rotations_from_angles(jnp.asarray(fit_angles(laid, points).angles))
+        _, rotations = forward_kinematics(jnp.asarray(laid, jnp.float32), turns)
+        own = (bones[..., None, :] @ np.asarray(rotations)[:, carriers])[..., 0, :].mean(0)
+        lengths = np.linalg.norm(laid[carried], axis=-1) / np.linalg.norm(own, axis=-1)
+        laid[carried] = own * lengths[:, None]
+    return laid
 
 
 def angle_deviation(skeleton: Array, angles: Array) -> Array:

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("jax")
 
-from jaxhand.fitting import angle_deviation, fit_angles
+from jaxhand.fitting import angle_deviation, fit_angles, rest_directions
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, POINTS, load_hand
 from numpy_infer.skeleton import forward_kinematics, rotations_from_angles
@@ -109,3 +109,20 @@ def test_bent_fingers_show_their_twist_and_straight_ones_do_not() -> None:
     assert angle_deviation(SKELETON, straight)[twist] > np.radians(25)
     assert angle_deviation(SKELETON, bent)[twist] < np.radians(5)
     assert angle_deviation(SKELETON, straight)[flexion] < np.radians(2)
+
+
+def test_bones_aside_of_their_hinges_are_found_and_lengths_kept() -> None:
+    angles, aside = np.where(TWISTS, 0, simulated(400)), np.array(SKELETON, np.float64)
+    for name in ("middle_dip", "pinky_pip", "pinky_dip"):
+        bone = aside[POINTS.index(name)]
+        length = np.linalg.norm(bone)
+        moved = bone + 0.05 * length * np.array([1, 0, 0])
+        aside[POINTS.index(name)] = moved * length / np.linalg.norm(moved)
+    for true in (aside, SKELETON):
+        turns = rotations_from_angles(angles)
+        points = forward_kinematics(true, turns, np.eye(3), np.zeros(3))[0]
+        found = rest_directions(SKELETON, points)
+        lengths = np.linalg.norm(SKELETON, axis=-1)
+        np.testing.assert_allclose(np.linalg.norm(found, axis=-1), lengths, rtol=1e-5)
+        before, after = (fit_angles(s, points).residual.mean() for s in (SKELETON, found))
+        assert after < max(0.7 * before, 1e-6)
