@@ -11,6 +11,7 @@ previous output becomes the correction; so the output goes on from where it was.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ import numpy as np
 from numpy_infer import gate
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import (
+    Pattern,
     fit,
     kabsch,
     mean_point,
@@ -62,8 +64,7 @@ def advance(
     frame = _steady(model, state, markers, accepted, weight, dt)
     if frame is None:
         frame = _unsteady(model, state, markers, accepted, weight, dt)
-    new_state = _blended(model, state, frame, markers, accepted, weight, dt)
-    new_state = new_state._replace(gate=own, rejected=rejected)
+    new_state = _blended(model, state, frame, markers, accepted, weight, dt, own, rejected)
     if np.count_nonzero(late):
         same = (accepted == state.visible).all(-1) & (markers == state.markers).all((-1, -2))
         new_state = choose(late & state.known.any(-1) & same, state, new_state)
@@ -77,10 +78,11 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
     own = gate.quietly(state.gate, markers, visible, dt) if model.gate else state.gate
     if own is None:
         return None
-    state = each(lambda leaf: leaf[None], state._replace(gate=own))
-    weight, elapsed = visible.astype(markers.dtype), np.cumsum(dt, 0)
+    state, own = (each(lambda leaf: leaf[None], tree) for tree in (state, own))
+    visible, elapsed = visible[:1], np.cumsum(dt, 0)
+    weight, rejected = visible.astype(markers.dtype), np.zeros_like(visible)
     frame = _steady(model, state, markers, visible, weight, elapsed)
-    return frame and _blended(model, state, frame, markers, visible, weight, elapsed)
+    return frame and _blended(model, state, frame, markers, visible, weight, elapsed, own, rejected)
 
 
 def _blended(
@@ -91,8 +93,10 @@ def _blended(
     visible: Array,
     weight: Array,
     dt: Array,
+    own: Any,
+    rejected: Array,
 ) -> State:
-    """The state after a frame: output and wrist, with corrections added."""
+    """The state after a frame: output and wrist, with corrections added. `own` is the gate's."""
     correction, placed, exact = frame.correction, frame.registered, frame.exact
     change = _change(frame, visible, weight)
     if model.continuity and np.count_nonzero(correction):
@@ -106,8 +110,8 @@ def _blended(
     rotation, position = frame.wrist or wrist_pose(model, output, frame.rotation)
     return State(
         right=state.right,
-        gate=state.gate,
-        rejected=np.zeros_like(visible),
+        gate=own,
+        rejected=rejected,
         predictor=frame.predictor,
         smoothing=state.smoothing,
         output=output,
@@ -159,15 +163,8 @@ def _steady(
     hand, tracking = model.hand, state.tracking
     if np.count_nonzero(visible != state.visible) or np.count_nonzero(tracking) < tracking.size:
         return None
-    # The registration and, from the same markers, the wrist's pose.
-    weights = np.empty((2, *weight.shape), weight.dtype)
-    weights[0], weights[1] = weight, hand.alignment_weight
-    template = hand.template.astype(markers.dtype, copy=False)
-    if model.wearer is not None:
-        template = np.stack([template, model.wearer.template.astype(markers.dtype)])
-        template = template.reshape(2, *(1,) * (markers.ndim - 2), *hand.template.shape)
     rotations, translations, second = fit(
-        pattern(template, weights),
+        _patterns(model, markers.dtype.char, visible.shape, visible.tobytes()),
         markers,
         lambda: np.stack(
             np.broadcast_arrays(_carried_prior(state, markers, weight), state.rotation)
@@ -210,6 +207,17 @@ def _steady(
         exact,
         (rotations[1], translations[1]) if direct else None,
     )
+
+
+@lru_cache(maxsize=64)
+def _patterns(model: Model, dtype: str, shape: tuple[int, ...], seen: bytes) -> Pattern:
+    """What a visible set `[..., M]` is registered to, frame after frame: the template by its
+    markers and, for the wrist's pose, the body's by the alignment markers."""
+    visible = np.frombuffer(seen, bool).reshape(shape)
+    weights = np.empty((2, *shape), dtype)
+    weights[0], weights[1] = visible, model.hand.alignment_weight
+    templates = np.array([model.hand.template, model.body.template], dtype)
+    return pattern(templates.reshape(2, *(1,) * (len(shape) - 1), *templates.shape[1:]), weights)
 
 
 def _unsteady(

@@ -16,6 +16,13 @@ from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
 from numpy_infer.predictors import PREDICTORS
 
+# As numbers: an enumeration's members are slow to reckon with.
+_PREDICTED, _HELD, _REJECTED = map(int, (Status.PREDICTED, Status.HELD, Status.REJECTED))
+_TRACKING, _DEGRADED, _LOST = map(int, TrackingState)
+_NON_POSITIVE_DT, _SUSPECTED_MILLIMETRES, _REJECTED_MARKERS = map(
+    int, (Notice.NON_POSITIVE_DT, Notice.SUSPECTED_MILLIMETRES, Notice.REJECTED_MARKERS)
+)
+
 HUGE = 1.0
 """Metres in the registered frame: no hand is this big; coordinates that say so are millimetres."""
 
@@ -40,22 +47,19 @@ def smoothed(model: Model, smoothing: Smoothing, state: State, dt: Array) -> tup
 def hand_pose(model: Model, state: State, late: Array) -> HandPose:
     """The output of a frame as the hand's own side has it, in arrays of the caller's own."""
     visible, tracking = state.visible, state.tracking
-    filled = np.full(tracking.shape, int(Status.HELD))
-    if PREDICTORS[model.predictor].uses_frame:
-        filled[tracking] = Status.PREDICTED
-    status = ~visible * filled[..., None]
-    notice = late * int(Notice.NON_POSITIVE_DT)
-    if np.count_nonzero(state.rejected):
-        status = np.where(state.rejected, int(Status.REJECTED), status)
-        notice = notice | state.rejected.any(-1) * int(Notice.REJECTED_MARKERS)
-    found = np.zeros_like(filled)
+    filled: Array | int = _PREDICTED if PREDICTORS[model.predictor].uses_frame else _HELD
+    found = np.zeros(tracking.shape, int)
     if np.count_nonzero(tracking) < tracking.size:
+        filled = np.where(tracking, filled, _HELD)[..., None]
         seen = visible.any(-1) & state.tracked
-        found = np.where(seen, int(TrackingState.DEGRADED), int(TrackingState.LOST))
-        found[tracking] = TrackingState.TRACKING
+        found = np.where(tracking, _TRACKING, np.where(seen, _DEGRADED, _LOST))
+    status, notice = ~visible * filled, late * _NON_POSITIVE_DT
+    if np.count_nonzero(state.rejected):
+        status = np.where(state.rejected, _REJECTED, status)
+        notice = notice | state.rejected.any(-1) * _REJECTED_MARKERS
     size = np.abs(state.seen)
     if size.max() > HUGE:
-        notice = notice | (size.max((-1, -2)) > HUGE) * int(Notice.SUSPECTED_MILLIMETRES)
+        notice = notice | (size.max((-1, -2)) > HUGE) * _SUSPECTED_MILLIMETRES
     pose = HandPose(
         markers=state.output.copy(),
         status=status,

@@ -202,31 +202,34 @@ def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
     """
     ends, has = hand.end_markers
     forms, dtype = _forms(hand), angles.dtype
-    value = _waves(angles[..., OUTER_ANGLES])
-    waves = np.zeros((*value.shape[:-1], 2, 3), dtype)
-    waves[..., 0, :] = value
-    waves[..., 1, 1], waves[..., 1, 2] = -value[..., 2], value[..., 1]
+    value = _waves(angles.take(OUTER_ANGLES, -1))
+    waves = (value @ _AND_SLOPE.astype(dtype, copy=False)).reshape(*value.shape[:-1], 2, 3)
     # Value and slope by the middle joint, times the abduction's value; then by the last joint.
     first = waves[..., 0, :, :, None] * value[..., 1, None, None, :]
     form = first.reshape(*first.shape[:-2], 9) @ forms.square.astype(dtype, copy=False)
     form = form @ waves[..., 2, :, :].swapaxes(-1, -2)
     reach = np.sqrt(np.maximum(form[..., :1, 0], 0))
     slopes = form.reshape(*form.shape[:-2], 4)[..., 2:0:-1] / (2 * np.where(reach > 0, reach, 1))
-    target = markers[..., ends, :] - hand.skeleton[1:16:3].astype(dtype, copy=False)
+    target = markers.take(ends, -2) - hand.skeleton[1:16:3].astype(dtype, copy=False)
     short = np.sqrt((target[..., None, :] @ target[..., None])[..., 0]) - reach
     if np.count_nonzero(has) < has.size:
         short = short * has.astype(dtype)[:, None]
     damped = (slopes[..., None, :] @ slopes[..., None])[..., 0] + (BEND_NOISE / BEND_PRIOR) ** 2
-    bend = slopes * (short / damped)
-    angles = angles.copy()
-    angles[..., FLEXIONS] += np.minimum(np.maximum(bend, -FARTHEST_BEND), FARTHEST_BEND)
-    return angles
+    bend = np.minimum(np.maximum(slopes * (short / damped), -FARTHEST_BEND), FARTHEST_BEND)
+    return angles + bend.reshape(*angles.shape[:-1], 10) @ _BENT.astype(dtype, copy=False)
+
+
+_AND_SLOPE = np.array([[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 1], [0, 0, 1, 0, -1, 0]])
+"""`[3, 6]` 1, cosine and sine, and their slopes, of such three."""
+_BENT = np.eye(len(ANGLES))[FLEXIONS.reshape(10)]
+"""`[10, 26]` all angles from the flexions."""
 
 
 def _waves(angles: Array) -> Array:
     """`[..., 3]` 1, cosine and sine of `[...]`."""
     waves = np.ones((*angles.shape, 3), angles.dtype)
-    waves[..., 1], waves[..., 2] = np.cos(angles), np.sin(angles)
+    np.cos(angles, waves[..., 1])
+    np.sin(angles, waves[..., 2])
     return waves
 
 
@@ -254,7 +257,7 @@ def place_fingers(
     """
     batch, dtype = angles.shape[:-1], angles.dtype
     forms, (ends, has) = _forms(hand), hand.end_markers
-    waves = _waves(angles[..., FINGER_ANGLES])
+    waves = _waves(angles.take(FINGER_ANGLES, -1))
     products = waves[..., 0, :, None] * waves[..., 1, None, :]
     products = (products[..., None] * waves[..., 2, None, None, :]).reshape(*batch, 5, 2, 1, 27)
     turn = (products[..., 0, :, :] @ BASE_FORM.astype(dtype, copy=False)).reshape(*batch, 5, 3, 3)
@@ -263,7 +266,7 @@ def place_fingers(
     base = hand.skeleton[1:16:3].astype(dtype, copy=False)
     if markers is not None:
         modelled = (turn @ own[..., 9:])[..., 0]
-        measured = markers[..., ends, :] - base
+        measured = markers.take(ends, -2) - base
         if np.count_nonzero(has) < has.size:
             measured = np.where(has[:, None] > 0, measured, modelled)
         turn = shortest_arc(modelled, measured) @ turn
@@ -272,7 +275,9 @@ def place_fingers(
     placed = turn @ own[..., :9]
     positions = np.zeros((*batch, len(POINTS), 3), dtype)
     positions[..., 1:16:3, :] = base
-    positions[..., BEYOND, :] = placed[..., :3].swapaxes(-1, -2) + base[..., None, :]
+    beyond = placed[..., :3].swapaxes(-1, -2) + base[:, None]
+    positions[..., 2:16:3, :], positions[..., 3:16:3, :] = beyond[..., 0, :], beyond[..., 1, :]
+    positions[..., 16:, :] = beyond[..., 2, :]
     rotations = np.empty((*batch, len(JOINTS), 3, 3), dtype)
     rotations[..., 0, :, :] = _EYE
     rotations[..., 1::3, :, :] = turn

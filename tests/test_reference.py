@@ -131,7 +131,7 @@ def bare(model: Model, predictor: str, markers: Array, dt: Array) -> Array:
     """`[T, M, 3]` what a predictor fills in on its own: frame 0 is passed through, and its last
     output is all it knows of what it said."""
     model = replace(model, predictor=predictor, continuity=False)
-    init, step, _ = PREDICTORS[predictor]
+    init, step, *_ = PREDICTORS[predictor]
     state, outputs = init(model), [markers[0]]
     visible = np.isfinite(markers).all(-1)
     assert visible[0].all()
