@@ -1,8 +1,8 @@
 """What a calibration is worth: `python experiments/person.py demo/model.npz`.
 
-Simulated people in the model's glove, each with bones of their own. Twenty seconds of free motion
-calibrate, the ten after them are measured: mean error of the joints through the whole pipeline for
-the model's hand, for one of the size found, and on the true bones.
+Simulated people in the model's glove, each with bones of their own and markers not quite in place.
+Twenty seconds of free motion calibrate, the ten after them are measured: mean error of the joints
+through the whole pipeline for the model's hand, for one of the size found, and on the true bones.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def main() -> None:
     before, after, best = np.mean(rows, 0)
     worse = sum(row[1] > row[0] for row in rows)
     print(
-        f"joints, cm: {before:.3f} uncalibrated, {after:.3f} calibrated, {best:.3f} on true bones;"
+        f"joints, cm: {before:.3f} uncalibrated, {after:.3f} calibrated, {best:.3f} on true bones"
     )
-    print(f"bones; {worse} of {len(rows)} people are worse off")
+    print(f"{worse} of {len(rows)} people are worse off")
 
 
 def error(model: Model, hand: Hand, markers: Array, truth: Array) -> float:

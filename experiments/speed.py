@@ -41,14 +41,17 @@ FRAMES = 20_000
 
 
 def interleaved(functions: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, Array]:
-    """Seconds `[rounds]` that each function took; the first round, which compiles, is left out."""
-    taken: dict[str, list[float]] = {name: [] for name in functions}
-    for _ in range(rounds + 1):
-        for name, run in functions.items():
+    """Seconds `[rounds]` that each function took. In every round the order is another: whoever
+    comes behind its like finds code and weights in the cache. The first round, which compiles, is
+    left out."""
+    rng, names = np.random.default_rng(0), list(functions)
+    taken = {name: np.empty(rounds + 1) for name in names}
+    for i in range(rounds + 1):
+        for name in rng.permutation(names):
             began = time.perf_counter()
-            run()
-            taken[name].append(time.perf_counter() - began)
-    return {name: np.array(seconds[1:]) for name, seconds in taken.items()}
+            functions[name]()
+            taken[name][i] = time.perf_counter() - began
+    return {name: seconds[1:] for name, seconds in taken.items()}
 
 
 def spread(values: Array, digits: int = 2) -> str:

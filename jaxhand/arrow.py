@@ -18,7 +18,6 @@ import numpy as np
 
 from jaxhand.geometry import product
 from jaxhand.motion import DIP_SHARE
-from jaxhand.simulation import BONE_SPREAD, PERSON_SPREAD
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import rotation_from_vector
@@ -88,9 +87,10 @@ LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
 class Priors(NamedTuple):
     """Standard deviations of what is known of a hand before it is measured."""
 
-    size: float = PERSON_SPREAD
-    """Of the logarithm of the hand's size against the given hand's."""
-    bone: float = BONE_SPREAD
+    size: float = 0.06
+    """Of the logarithm of the hand's size against the given hand's: our choice, somewhat less than
+    among people, see `anthropometry.SIZE_SPREAD`."""
+    bone: float = 0.03
     """Of the logarithm of a bone's length beside it; a finger's base is as far off in any
     direction."""
     offset: float = 5e-3

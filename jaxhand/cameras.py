@@ -18,7 +18,7 @@ import numpy as np
 from jaxhand.anthropometry import People, placed
 from jaxhand.contact import capsules
 from jaxhand.geometry import apart, mirror, mirror_rotation, product
-from jaxhand.motion import HOME, Motion
+from jaxhand.motion import HOME, Motion, uniform
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.hand import JOINTS, PARENTS, THUMB_AXES, Hand, flat_points
@@ -293,7 +293,7 @@ def conditions(
 ) -> Conditions:
     """Draws them."""
     camera_key, noise_key, dropout_key = jax.random.split(key, 3)
-    lost, _ = spells(dropout_key, rig.dropouts, frames, rate, (*batch, markers))
+    lost, _ = spells(uniform(dropout_key, (*batch, frames, markers)), rig.dropouts, rate)
     cameras = place_cameras(camera_key, rig, batch)[..., None, :, :]
     return Conditions(cameras, jax.random.normal(noise_key, lost.shape), lost)
 
@@ -361,26 +361,23 @@ def film(
     return under(Conditions(given.cameras, flicker, lost), each, rig), beside
 
 
-def spells(
-    key: Array, what: Spells, frames: int, rate: float, batch: tuple[int, ...] = ()
-) -> tuple[Array, Array]:
-    """Times that begin at random in `frames` frames at `rate` Hz, each by itself.
+def spells(draws: Array, what: Spells, rate: float) -> tuple[Array, Array]:
+    """Times that begin at random in frames at `rate` Hz, out of `draws [..., T, B]` in 0 to 1, each
+    of the B by itself; none in the first frame.
 
     Returns:
-        `[..., T, B]` each for a `batch` of `(..., B)`: True inside of a spell; the frame in which
-        the last of them began.
+        `[..., T, B]` each: True inside of a spell; the frame in which the last of them began, 0
+        before the first.
     """
-    *leading, last = batch
-    draws = jax.random.uniform(key, (*leading, frames, last), minval=1e-6)
+    now = jnp.arange(draws.shape[-2])[:, None]
     chance = what.per_second / rate
-    begins = draws < chance
+    begins = (draws < chance) & (now > 0)
     # What is left of a draw below the chance is again uniform.
     part = jnp.clip(draws / jnp.maximum(chance, 1e-12), 1e-6, 1 - 1e-6)
     length = jnp.round(rate * what.seconds * (part / (1 - part)) ** what.tail)
-    now = jnp.arange(frames)[:, None]
     length = jnp.clip(length, 1, rate * LONGEST).astype(now.dtype)
-    ends = jax.lax.cummax(jnp.where(begins, now + length, 0), len(leading))
-    return now < ends, jax.lax.cummax(jnp.where(begins, now, 0), len(leading))
+    ends = jax.lax.cummax(jnp.where(begins, now + length, 0), draws.ndim - 2)
+    return now < ends, jax.lax.cummax(jnp.where(begins, now, 0), draws.ndim - 2)
 
 
 def neighbours(hand: Hand) -> Array:
@@ -409,19 +406,19 @@ def misplace(
     """
     *batch, frames, count, _ = markers.shape
     jump_key, offset_key, frozen_key, swap_key = jax.random.split(key, 4)
-    jumped, began = spells(jump_key, faults.jumps, frames, rate, (*batch, count))
+    jumped, began = spells(uniform(jump_key, visible.shape), faults.jumps, rate)
     offsets = faults.jump * jax.random.normal(offset_key, markers.shape)
     offsets = jnp.take_along_axis(offsets, began[..., None], -3)
     measured = jnp.where(jumped[..., None], markers + offsets, markers)
 
-    frozen, began = spells(frozen_key, faults.frozen, frames, rate, (*batch, count))
+    frozen, began = spells(uniform(frozen_key, visible.shape), faults.frozen, rate)
     now = jnp.arange(frames)[:, None]
     last = jax.lax.cummax(jnp.where(visible, now, -1), len(batch))
     last = jnp.take_along_axis(last, began, -2)
     held = jnp.take_along_axis(measured, jnp.maximum(last, 0)[..., None], -3)
     measured = jnp.where((frozen & (last >= 0))[..., None], held, measured)
 
-    swapped, _ = spells(swap_key, faults.swaps, frames, rate, (*batch, len(pairs)))
+    swapped, _ = spells(uniform(swap_key, (*batch, frames, len(pairs))), faults.swaps, rate)
     order = jnp.broadcast_to(jnp.arange(count), visible.shape)
     for index, (one, other) in enumerate(np.asarray(pairs)):
         swap = swapped[..., index]

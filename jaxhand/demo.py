@@ -24,7 +24,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from jaxhand import evaluation, pictures, simulation
 from jaxhand.export import export, finish
 from jaxhand.report import print_table3
-from jaxhand.sequences import RATE, Sequence
+from jaxhand.sequences import RATE
 from jaxhand.tasks import Frames
 from jaxhand.training import Metrics, TrainingConfig, fit_networks
 from numpy_infer.arrays import Array
@@ -106,7 +106,7 @@ def demo(config: DemoConfig) -> None:
     model = _train(hand, people, size, config.seed, console)
     if not config.short:
         with _progress(console, "choosing the blend on validation"):
-            model = finish(model, sequences(people.validation))
+            model = finish(model, simulation.sequences(people.validation))
     config.out.mkdir(parents=True, exist_ok=True)
     path = config.out / "model.npz"
     export(model, path, overwrite=config.overwrite)
@@ -118,7 +118,7 @@ def demo(config: DemoConfig) -> None:
         def report(name: str, share: float) -> None:
             bar((list(rows).index(name) + share) / len(rows))
 
-        test = sequences(people.test)
+        test = simulation.sequences(people.test)
         table = evaluation.table3(rows, test, seeds=size.seeds, report=report)
     print_table3(table, console)
     text = json.dumps({"table3": table}, indent=1)
@@ -146,14 +146,6 @@ def _part(streams: simulation.Streams, which: slice) -> simulation.Streams:
     """Some of the people."""
     parts = {name: array[which] for name, array in streams._asdict().items() if name != "time"}
     return simulation.Streams(**parts, time=streams.time)
-
-
-def sequences(streams: simulation.Streams) -> list[Sequence]:
-    """The streams without their gaps, as the evaluation takes them."""
-    return [
-        Sequence(f"person {i}", f"person {i}", RATE, markers)
-        for i, markers in enumerate(streams.markers)
-    ]
 
 
 def stream_errors(output: Array, truth: Array, visible: Array) -> dict[int, float]:

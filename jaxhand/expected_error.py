@@ -8,17 +8,14 @@ fits worse are told so.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from jaxhand import anthropometry, motion, simulation
 from jaxhand import sequences as data
-from jaxhand.contact import marked
-from jaxhand.motion import Motion
+from jaxhand import simulation
 from numpy_infer import tracker
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
@@ -44,28 +41,11 @@ PEOPLE, SECONDS = 64, 10
 
 
 def people(
-    hand: Hand,
-    seed: int,
-    count: int = PEOPLE,
-    seconds: float = SECONDS,
-    moves: Callable[..., Motion] = motion.motion,
+    hand: Hand, seed: int, count: int = PEOPLE, seconds: float = SECONDS
 ) -> list[data.Sequence]:
-    """Simulated people in motion, each with bones of their own and markers not quite in place.
-    `moves` is called as `motion.motion`."""
-
-    @jax.jit
-    def run(key: Array) -> Array:
-        who, place, move = jax.random.split(key, 3)
-        group = anthropometry.people(who, hand, (count,))
-        offsets = anthropometry.placed(place, hand, group)[:, None]
-        there = moves(move, round(seconds * data.RATE), data.RATE, (count,), group)
-        return marked(replace(hand, offsets=offsets), group.skeleton[:, None], *there)[0]
-
-    found = np.asarray(run(jax.random.key(seed)))
-    return [
-        data.Sequence(f"person {i}", f"person {i}", data.RATE, markers)
-        for i, markers in enumerate(found)
-    ]
+    """Simulated people in motion, each with bones of their own and markers not quite in place."""
+    frames = round(seconds * data.RATE)
+    return simulation.sequences(simulation.streams(jax.random.key(seed), hand, count, frames))
 
 
 class Samples(NamedTuple):

@@ -22,8 +22,8 @@ from numpy_infer.model import Model
 from numpy_infer.skeleton import marker_positions
 
 SIZES = np.exp(np.linspace(-0.25, 0.25, 51))
-"""Of the model's hand: four standard deviations of people's (see `simulation.PERSON_SPREAD`), in
-steps of one per cent."""
+"""Of the model's hand: three and a half standard deviations of people's (see
+`anthropometry.SIZE_SPREAD`), in steps of one per cent."""
 FRAMES, FEWEST = 600, 30
 """At most so many frames are looked at, evenly spread; and at least so many are needed."""
 FAR = 20e-3

@@ -3,7 +3,7 @@
 A posture is one of `KEYFRAMES`, varied: fingers bend together along two synergies (Santello,
 Flanders and Soechting, J. Neurosci. 18, 1998, find two of them behind more than 80 % of the
 variance of grasps), neighbours are enslaved to each other (Zatsiorsky, Li and Latash, Exp. Brain
-Res. 131, 2000; Hager-Ross and Schieber, J. Neurosci. 20, 2000), a DIP joint follows its PIP joint,
+Res. 131, 2000; Häger-Ross and Schieber, J. Neurosci. 20, 2000), a DIP joint follows its PIP joint,
 a flexed finger can hardly be spread. Pads that touch do so on the person's own bones, and what
 would reach into other flesh is drawn back towards its keyframe.
 """
@@ -46,9 +46,10 @@ TURN_SPREAD = (0.5, 0.4, 0.8)
 """Radians: standard deviation of its pitch, yaw and roll, beside the heading of the stream."""
 
 TREMOR_HERTZ, TREMOR = (8.0, 12.0), 1.2e-3
-"""Physiological tremor has its peak at 9 Hz (Marsden et al., EEG Clin. Neurophysiol. 27, 1969);
-radians at a knuckle, so about 0.1 mm at the tip: the 0.01 g of Wade, Gresty and Findley (Arch.
-Neurol. 39, 1982), twice over for fingers that hold nothing."""
+"""An outstretched finger's tremor has its peak about 9 Hz (Marsden et al., EEG Clin. Neurophysiol.
+27, 1969). Radians at a knuckle, so somewhat over 0.1 mm at the tip, chosen by eye: about as much as
+with the arm held out, 4 to 5 times the 0.03 mm of a hand at rest (Growdon et al., Electromyogr.
+Clin. Neurophysiol. 40, 2000)."""
 SWAY_HERTZ, SWAY = (0.2, 1.0), 1.5e-2
 """What a hand drifts about while it holds a posture, radians."""
 
@@ -120,15 +121,17 @@ _ROWS = (
     ("spoon", 2, (49, 61, 64, 68), (43, 68, 78, 80), (4, -3, 0, 0), (34, 14, -13, 23, -3, 29), 8),
 )
 KEYFRAMES = tuple(Keyframe(*row) for row in _ROWS)
-"""Gestures and the usual grasps (Feix et al., The GRASP taxonomy, 2016, has the names)."""
+"""Gestures and the usual grasps: some of the 33 types of Feix et al. (The GRASP taxonomy of human
+grasp types, 2016), more coarsely named. Their angles and shares are our choice, by eye."""
 
 TOGETHER, OPPOSITE, ALONG, ALONE = 0.75, 0.4, 0.3, 0.3
 """How a keyframe's flexions vary, as parts of its `spread`: all joints of all fingers together; MCP
 against PIP joints, Santello's first and second synergy; from index to pinky; each for itself."""
 ENSLAVED = (0.16, 0.05, 0.03), (0.22, 0.1), (0.35,)
 """Of one finger's flexion that others take on, index with middle, ring and pinky, middle with ring
-and pinky, ring with pinky: our choice, least for the index finger and most between ring and pinky,
-which is the order that the papers find."""
+and pinky, ring with pinky: our choice, by eye. Neighbours share more (Zatsiorsky et al.), and the
+index finger less than middle and ring (Häger-Ross and Schieber, who say the same of the little
+finger; here it shares more)."""
 
 _SHARES = np.array([frame.share for frame in KEYFRAMES])
 _LIMITS = np.cumsum(_SHARES)[:-1] / _SHARES.sum()
@@ -242,6 +245,7 @@ def motion(
     rate: float,
     batch: tuple[int, ...] = (),
     people: People | None = None,
+    postures: Array | None = None,
 ) -> Motion:
     """Moves from posture to posture, with rests and tremor, while the wrist wanders and turns.
 
@@ -251,16 +255,20 @@ def motion(
         rate: frames per second.
         batch: leading shape.
         people: `[...]` who moves, of shape `batch`; by default the mean person.
+        postures: `[..., K, 26]` radians: what they move between, one of them after the other; by
+            default `stops`. After the last of them, for which `enough` has a number, they rest.
     """
     people = mean_person(load_hand("glove9")) if people is None else people
     people = jax.tree.map(lambda array, own: jnp.expand_dims(array, -own - 1), people, People(2, 1))
     time = jnp.arange(frames, dtype=jnp.float32) / rate
-    count = enough(frames / rate, MOVE_SECONDS)
+    count = enough(frames / rate, MOVE_SECONDS) if postures is None else postures.shape[-2]
     sizes = (count * STOP_DRAWS, 7 * (count - 1), wander_draws(frames / rate), 44)
     draws = uniform(key, (*batch, sum(sizes)))
-    postures, timing, wandering, shakes = jnp.split(draws, np.cumsum(sizes[:-1]), -1)
+    stopping, timing, wandering, shakes = jnp.split(draws, np.cumsum(sizes[:-1]), -1)
     plan = schedule(timing, time, MOVE_SECONDS)
-    angles = bend(stops(postures.reshape(*batch, count, STOP_DRAWS), people), plan, people)
+    if postures is None:
+        postures = stops(stopping.reshape(*batch, count, STOP_DRAWS), people)
+    angles = bend(postures, plan, people)
     place, turn = wander(wandering, time)
     shake, drift, sway = shaking(shakes, time)
     return Motion(

@@ -1,4 +1,4 @@
-"""Hands, motion and gaps out of a random key: something to train on before there is a recording.
+"""Frames and recordings of hands out of a random key, to train on before there are real ones.
 
 Everything is a canonical left hand in metres, seconds and radians, float32. The same key gives the
 same result; every function is pure, and safe under jit and vmap.
@@ -8,44 +8,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxhand.anthropometry import people, placed
+from jaxhand.cameras import Spells, spells
 from jaxhand.contact import marked
-from jaxhand.motion import (
-    DIP_SHARE,
-    HOME,
-    TURN_SPREAD,
-    WRIST_MOVE_SECONDS,
-    WRIST_SPREAD,
-    Motion,
-    from_pitch_yaw_roll,
-    minimum_jerk,
-)
-from jaxhand.skeleton import forward_kinematics, marker_positions, rotations_from_angles
+from jaxhand.motion import DIP_SHARE, minimum_jerk, motion, uniform
+from jaxhand.sequences import RATE, Sequence
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, POINTS, Hand
+from numpy_infer.hand import ANGLES, Hand
 
-PERSON_SPREAD, BONE_SPREAD = 0.06, 0.03
-"""Standard deviations of the logarithm of a hand's size (Garrett, *The adult human hand*, 1971),
-and of a bone's length beside it."""
-
-MOVE_SECONDS = (0.2, 1.5)
-"""Shortest and longest move from one posture to the next."""
-REST_SHARE, REST_SECONDS = 0.5, 0.5
-"""Share of moves that a rest follows, and the mean of these rests."""
-
-GAP_SECONDS, GAP_TAIL = 0.1, 0.6
-"""Median length of a gap, and how heavy the tail is: 90 % are shorter than 0.37 s (paper, section
-6.1: 0.36 s), one in fifty is longer than a second."""
-SEEN_SECONDS = 3.0
-"""Mean time from the end of a marker's gap to its next."""
-CLEAR_SECONDS = 5.0
-"""Mean time from the end of one obstacle, which hides several markers at once, to the next."""
+GAPS = Spells(1 / 3, 0.1, 0.6)
+"""Of each marker by itself. 90 % are shorter than 0.37 s (paper, section 6.1: 0.36 s), one in fifty
+is longer than a second."""
+OBSTACLES = Spells(1 / 5, 0.1, 0.6)
+"""Of what hides several markers at once."""
 
 
 class PoseKind(NamedTuple):
@@ -100,16 +82,10 @@ class Streams(NamedTuple):
     """`[N, T, 3]` metres, world."""
     skeleton: Array
     """`[N, 21, 3]` metres: each person's own bones, constant in time."""
+    offsets: Array
+    """`[N, M, 3]` metres: where each marker really sits, as `Hand.offsets`, constant in time."""
     time: Array
     """`[T]` seconds."""
-
-
-def bone_lengths(key: Array, hand: Hand, batch: tuple[int, ...] = ()) -> Array:
-    """`[..., 21, 3]` metres: skeletons of people, each point from its parent in the flat hand.
-    Bones keep their directions and differ in length."""
-    normal = jax.random.normal(key, (*batch, 1 + len(POINTS), 1))
-    scale = jnp.exp(PERSON_SPREAD * normal[..., :1, :] + BONE_SPREAD * normal[..., 1:, :])
-    return jnp.asarray(hand.skeleton, jnp.float32) * scale
 
 
 def poses(key: Array, batch: tuple[int, ...] = ()) -> Array:
@@ -145,74 +121,48 @@ def poses(key: Array, batch: tuple[int, ...] = ()) -> Array:
     return jnp.clip(angles, jnp.asarray(_LOW), jnp.asarray(_HIGH))
 
 
-def motion(key: Array, frames: int, rate: float, batch: tuple[int, ...] = ()) -> Motion:
-    """Moves from posture to posture, with rests, while the wrist wanders and turns by itself.
-
-    Args:
-        key: what it is drawn from.
-        frames: T, the number of frames.
-        rate: frames per second.
-        batch: leading shape.
-    """
-    pose_key, hand_key, place_key, wrist_key, heading_key = jax.random.split(key, 5)
-    time = jnp.arange(frames, dtype=jnp.float32) / rate
-    stops = poses(pose_key, (*batch, _stops(frames, rate, MOVE_SECONDS)))
-    angles = _travel(hand_key, stops, time, MOVE_SECONDS)
-
-    count = _stops(frames, rate, WRIST_MOVE_SECONDS)
-    spread = jnp.array((*WRIST_SPREAD, *TURN_SPREAD))
-    places = jax.random.normal(place_key, (*batch, count, 6)) * spread
-    wrist = _travel(wrist_key, places, time, WRIST_MOVE_SECONDS)
-    heading = jax.random.uniform(heading_key, (*batch, 1), minval=-math.pi, maxval=math.pi)
-    return Motion(
-        angles=angles,
-        wrist_rotation=from_pitch_yaw_roll(
-            jnp.stack([wrist[..., 3], wrist[..., 4] + heading, wrist[..., 5]], -1)
-        ),
-        wrist_position=jnp.array(HOME) + wrist[..., :3],
-    )
-
-
 def gaps(key: Array, frames: int, markers: int, rate: float, batch: tuple[int, ...] = ()) -> Array:
     """`[..., T, M]` True where visible. Now and then each marker is lost by itself, and now and
     then an obstacle hides several at random. In the first frame all are seen."""
-    draws = jax.random.uniform(key, (*batch, frames, 2 * markers + 2), minval=1e-6)
+    draws = uniform(key, (*batch, frames, 2 * markers + 2))
     own, obstacle, share, hides = jnp.split(draws, (markers, markers + 1, markers + 2), -1)
-    lost, _ = _hidden(own, rate, SEEN_SECONDS)
-    behind, began = _hidden(obstacle, rate, CLEAR_SECONDS)
+    lost, _ = spells(own, GAPS, rate)
+    behind, began = spells(obstacle, OBSTACLES, rate)
     # An obstacle hides the same markers as long as it is there.
     hides = jnp.take_along_axis(hides < share, began, -2)
     return ~(lost | (behind & hides))
 
 
-def markers(
-    hand: Hand, skeleton: Array, angles: Array, wrist_rotation: Array, wrist_position: Array
-) -> Array:
-    """`[..., M, 3]` metres, world: the hand's markers on the bones `[..., 21, 3]` of somebody else,
-    at `angles [..., 26]`, `wrist_rotation [..., 3, 3]` and `wrist_position [..., 3]`."""
-    local = rotations_from_angles(angles)
-    return marker_positions(
-        hand, *forward_kinematics(skeleton, local, wrist_rotation, wrist_position)
-    )
-
-
-def streams(key: Array, hand: Hand, count: int, frames: int, rate: float = 60.0) -> Streams:
-    """Recordings of `count` people, `frames` frames each at `rate` Hz."""
-    bone_key, motion_key, gap_key = jax.random.split(key, 3)
-    skeleton = bone_lengths(bone_key, hand, (count,))
-    angles, rotation, position = motion(motion_key, frames, rate, (count,))
-    local = rotations_from_angles(angles)
-    positions, rotations = forward_kinematics(skeleton[:, None], local, rotation, position)
+# As a whole: operation by operation it is compiled for three times as long.
+@partial(jax.jit, static_argnames=("hand", "count", "frames", "rate"))
+def streams(key: Array, hand: Hand, count: int, frames: int, rate: float = RATE) -> Streams:
+    """Recordings of `count` people, `frames` frames each at `rate` Hz, with markers on the skin and
+    not quite where they should be."""
+    who, place, move_key, gap_key = jax.random.split(key, 4)
+    group = people(who, hand, (count,))
+    offsets = placed(place, hand, group)
+    move = motion(move_key, frames, rate, (count,), group)
+    worn = replace(hand, offsets=offsets[:, None])
+    markers, positions = marked(worn, group.skeleton[:, None], *move)
     return Streams(
-        markers=marker_positions(hand, positions, rotations),
+        markers=markers,
         visible=gaps(gap_key, frames, len(hand), rate, (count,)),
-        angles=angles,
+        angles=move.angles,
         positions=positions,
-        wrist_rotation=rotation,
-        wrist_position=position,
-        skeleton=skeleton,
+        wrist_rotation=move.wrist_rotation,
+        wrist_position=move.wrist_position,
+        skeleton=group.skeleton,
+        offsets=offsets,
         time=jnp.arange(frames, dtype=jnp.float32) / rate,
     )
+
+
+def sequences(streams: Streams) -> list[Sequence]:
+    """Streams at 60 Hz without their gaps, as evaluations take them."""
+    return [
+        Sequence(f"person {i}", f"person {i}", RATE, markers)
+        for i, markers in enumerate(np.asarray(streams.markers))
+    ]
 
 
 def frames(key: Array, hand: Hand, count: int) -> tuple[Array, Array]:
@@ -230,56 +180,5 @@ def frames(key: Array, hand: Hand, count: int) -> tuple[Array, Array]:
 def still_markers(hand: Hand, skeleton: Array, angles: Array) -> Array:
     """`[N, M, 3]` metres, hand frame: the hand's markers on the bones `[..., 21, 3]` at `angles
     [N, 26]`."""
-    eye = jnp.broadcast_to(jnp.eye(3), (len(angles), 3, 3))
     skeleton = jnp.asarray(skeleton, jnp.float32)
-    return markers(hand, skeleton, angles, eye, jnp.zeros((len(angles), 3)))
-
-
-def _stops(frames: int, rate: float, seconds: tuple[float, float]) -> int:
-    """Enough stops even if all moves are of the shortest."""
-    return math.ceil(frames / rate / seconds[0]) + 2
-
-
-def _travel(key: Array, stops: Array, time: Array, seconds: tuple[float, float]) -> Array:
-    """`[..., T, D]`: from stop to stop `[..., K, D]` in moves of random duration, some with a rest
-    after them."""
-    draws = jax.random.uniform(key, (2, *stops.shape[:-2], stops.shape[-2] - 1), minval=1e-6)
-    shortest, longest = seconds
-    length = shortest * (longest / shortest) ** draws[0]
-    # What is left of the draw below REST_SHARE is again uniform, so its logarithm exponential.
-    rest = REST_SECONDS * jnp.maximum(-jnp.log(draws[1] / REST_SHARE), 0)
-    end = jnp.cumsum(length + rest, -1)
-    start = jnp.concatenate([jnp.zeros_like(end[..., :1]), end[..., :-1]], -1)
-    move = (time[:, None] >= end[..., None, :]).sum(-1)
-    since = time - jnp.take_along_axis(start, move, -1)
-    share = minimum_jerk(jnp.clip(since / jnp.take_along_axis(length, move, -1), 0, 1))[..., None]
-    before = jnp.take_along_axis(stops, move[..., None], -2)
-    after = jnp.take_along_axis(stops, move[..., None] + 1, -2)
-    return before + share * (after - before)
-
-
-def _hidden(draws: Array, rate: float, seen: float) -> tuple[Array, Array]:
-    """Processes that wait, `seen` seconds on average, for gaps of log-logistic length, out of
-    `draws [..., T, P]` in 0 to 1.
-
-    Returns:
-        `[..., T, P]` each: True in the gaps; the frame in which the last wait or gap began.
-    """
-    draws = jnp.moveaxis(draws, -2, 0)
-    waits = -rate * seen * jnp.log(draws)
-    lengths = rate * GAP_SECONDS * (draws / (1 - draws)) ** GAP_TAIL
-
-    def frame(state: tuple[Array, Array, Array], now: Any) -> tuple[Any, tuple[Array, Array]]:
-        number, wait, length = now
-        hidden, left, began = state
-        change = left < 1
-        hidden = hidden ^ change
-        drawn = jnp.maximum(jnp.where(hidden, length, wait), 1)
-        left = jnp.where(change, drawn, left) - 1
-        began = jnp.where(change, number, began)
-        return (hidden, left, began), (hidden, began)
-
-    none = jnp.zeros(draws.shape[1:], bool)
-    start = (none, jnp.maximum(waits[0], 1), none.astype(int))
-    _, (hidden, began) = jax.lax.scan(frame, start, (jnp.arange(len(draws)), waits, lengths))
-    return jnp.moveaxis(hidden, 0, -2), jnp.moveaxis(began, 0, -2)
+    return marked(hand, skeleton, angles, jnp.eye(3), jnp.zeros(3))[0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -10,7 +10,6 @@ import numpy as np
 from jaxhand import simulation
 from jaxhand.datasets import Split, load, parse_spec
 from jaxhand.expected_error import people
-from jaxhand.motion import Motion
 from jaxhand.occlusions import FEWEST_LEFT
 from jaxhand.sequences import Dataset, Sequence
 from jaxhand.tasks import Frames
@@ -90,13 +89,9 @@ def _sequences(validation: list[Dataset], hand: Hand, seed: int) -> list[Sequenc
 
 
 def simulated_sequences(hand: Hand, seed: int) -> list[Sequence]:
-    """Simulated people in motion, in the postures that are trained on. Their markers are not quite
-    in place: on gloves put on by the millimetre a network looks better than it will be."""
-
-    def moves(key: Array, frames: int, rate: float, batch: tuple[int, ...], _: Any) -> Motion:
-        return simulation.motion(key, frames, rate, batch)
-
-    return people(hand, seed, PEOPLE, SECONDS, moves)
+    """Simulated people in motion. Their markers are not quite in place: on gloves put on by the
+    millimetre a network looks better than it will be."""
+    return people(hand, seed, PEOPLE, SECONDS)
 
 
 def _share(simulated: float, frames: Frames) -> float:

@@ -12,10 +12,10 @@ import pytest
 
 jax = pytest.importorskip("jax")
 
-from simulated import quickly  # noqa: E402
+from simulated import bones, quickly  # noqa: E402
 from strategies import turn  # noqa: E402
 
-from jaxhand import arrow, simulation  # noqa: E402
+from jaxhand import arrow, motion, simulation  # noqa: E402
 from jaxhand.calibration import (  # noqa: E402
     Calibration,
     Priors,
@@ -41,7 +41,9 @@ from numpy_infer.skeleton import (  # noqa: E402
     rotations_from_angles,
 )
 
-PEOPLE, STRANGERS, FRAMES, RATE, NOISE = 8, 16, 240, 60.0, 1e-3
+PEOPLE, FRAMES, RATE, NOISE = 16, 240, 30.0, 1e-3
+FOUR_SECONDS = 60.0
+"""The rate at which as many frames are half as long."""
 OFFSET = 2e-3
 """Metres per axis: how far off the markers are, and are said to be."""
 DENSE, GLOVE = load_hand("dense19"), load_hand("glove9")
@@ -62,25 +64,26 @@ class Person(NamedTuple):
     markers: Array
 
 
-bone_lengths = quickly(simulation.bone_lengths, static_argnums=1)
-
-
 @functools.cache
-def motions() -> Motion:
-    keys = jax.random.split(jax.random.key(0), STRANGERS)
-    move = quickly(jax.vmap(lambda key: simulation.motion(key, FRAMES, RATE)))
-    return jax.tree.map(lambda array: np.asarray(array, np.float64), move(keys))
+def motions(rate: float) -> Motion:
+    """Four or eight seconds of each, from posture to posture of those that the prior is rounded
+    from."""
+    count = motion.enough(FRAMES / rate, motion.MOVE_SECONDS)
+
+    def draw(key: Array) -> Motion:
+        postures = simulation.poses(key, (PEOPLE, count))
+        return motion.motion(key, FRAMES, rate, (PEOPLE,), postures=postures)
+
+    move = quickly(draw)(jax.random.key(0))
+    return jax.tree.map(lambda array: np.asarray(array, np.float64), move)
 
 
-def person(
-    number: int, hand: Hand = DENSE, still: bool = False, bones: Array | None = None
-) -> Person:
-    if bones is None:
-        bones = bone_lengths(jax.random.key(number), hand)
+def person(number: int, hand: Hand = DENSE, still: bool = False, rate: float = RATE) -> Person:
+    """Somebody out of the very priors that the fit is given."""
     random = np.random.default_rng(number)
     offsets = hand.offsets + OFFSET * random.normal(size=hand.offsets.shape)
-    own = replace(hand, offsets=offsets).with_skeleton(np.asarray(bones))
-    angles, rotation, position = (array[number] for array in motions())
+    own = replace(hand, offsets=offsets).with_skeleton(bones(100 + number, hand))
+    angles, rotation, position = (array[number] for array in motions(rate))
     if still:
         angles = np.repeat(angles[:1], FRAMES, 0)
     turns = rotations_from_angles(angles)
@@ -90,9 +93,13 @@ def person(
     return Person(own, angles, rotation, position, points, markers)
 
 
+def fitted(markers: Array, hand: Hand = DENSE, rate: float = RATE) -> Calibration:
+    return calibrate(hand, markers, rate=rate, priors=Priors(offset=OFFSET))
+
+
 @functools.cache
-def calibrated(number: int, hand: Hand = DENSE) -> Calibration:
-    return calibrate(hand, person(number, hand).markers, priors=Priors(offset=OFFSET))
+def calibrated(number: int, hand: Hand, rate: float) -> Calibration:
+    return fitted(person(number, hand, rate=rate).markers, hand, rate)
 
 
 def places(found: Calibration) -> Array:
@@ -117,9 +124,11 @@ def rms(array: Array) -> float:
     return float(np.sqrt((np.asarray(array) ** 2).mean()))
 
 
-def everyone(hand: Hand = DENSE, count: int = PEOPLE) -> list[tuple[Calibration, Unknowns, Array]]:
+def everyone(
+    hand: Hand = DENSE, count: int = PEOPLE, rate: float = RATE
+) -> list[tuple[Calibration, Unknowns, Array]]:
     """Of each person: what was found, its errors, and `[T, 21]` how far points are off."""
-    people = [(calibrated(i, hand), person(i, hand)) for i in range(count)]
+    people = [(calibrated(i, hand, rate), person(i, hand, rate=rate)) for i in range(count)]
     return [
         (found, errors(found, true), np.linalg.norm(places(found) - true.positions, axis=-1))
         for found, true in people
@@ -127,28 +136,17 @@ def everyone(hand: Hand = DENSE, count: int = PEOPLE) -> list[tuple[Calibration,
 
 
 def test_dense_markers_give_first_bones_knuckle_angles_and_middle_joints() -> None:
-    found = everyone()
+    found = everyone(DENSE, 8, FOUR_SECONDS)
     first = [error.bone_lengths[PIP_POINTS] for _, error, _ in found]
     assert rms(first) < 2e-3
     assert np.degrees(rms([error.angles[:, MCP] for _, error, _ in found])) < 3
     assert rms([off[:, PIP_POINTS] for _, _, off in found]) < 2e-3
-    assert [c.noise for c, _, _ in found] == pytest.approx([NOISE] * PEOPLE, rel=0.1)
-
-
-def stranger(number: int) -> Person:
-    """Somebody out of the very priors that the fit is given, fingers' bases included."""
-    spread = np.repeat([arrow.PERSON_SPREAD, arrow.BONE_SPREAD, arrow.BONE_SPREAD], arrow.WIDTHS)
-    unlike = spread * np.random.default_rng(100 + number).normal(size=len(spread))
-    bones = arrow.skeleton(np.float32(DENSE.skeleton), np.float32(unlike))
-    return person(number, bones=bones)
+    assert [c.noise for c, _, _ in found] == pytest.approx([NOISE] * 8, rel=0.1)
 
 
 def test_intervals_hold_what_they_say() -> None:
     inside: dict[str, list[float]] = {field: [] for field in Unknowns._fields}
-    for number in range(STRANGERS):
-        true = stranger(number)
-        found = calibrate(DENSE, true.markers, priors=Priors(offset=OFFSET))
-        error = errors(found, true)
+    for found, error, _ in everyone():
         for field in Unknowns._fields:
             off, half = np.abs(getattr(error, field)), getattr(found.interval, field)
             rest = slice(1, None) if field == "bone_lengths" else slice(None)  # the wrist is none
@@ -193,10 +191,15 @@ def everywhere() -> Hand:
 
 
 def test_a_marker_on_every_phalanx_gives_all_joints() -> None:
-    found = everyone(everywhere(), 4)
+    """All angles but for a constant each, which is where the markers sit: 2 mm are 9° of a last
+    phalanx."""
+    found = everyone(everywhere(), 4, FOUR_SECONDS)
     assert rms([error.bone_lengths for _, error, _ in found]) < 2e-3
     assert np.degrees(rms([error.angles[:, MCP + PIP] for _, error, _ in found])) < 3
     assert rms([off[:, : len(JOINTS)] for _, _, off in found]) < 2e-3
+    moved = [error.angles - error.angles.mean(0) for _, error, _ in found]
+    for name, joint in zip(NAMES, np.moveaxis(moved, -1, 0), strict=True):
+        assert np.degrees(rms(joint)) < 3, name
 
 
 def spoiled(true: Person, how: str) -> tuple[Array, Array]:
@@ -211,9 +214,9 @@ def spoiled(true: Person, how: str) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize("how", ["ghosts", "gaps"])
 def test_ghosts_and_gaps_hardly_change_the_hand(how: str) -> None:
-    true, clean = person(3), calibrated(3)
+    true, clean = person(3), calibrated(3, DENSE, RATE)
     markers, where = spoiled(true, how)
-    found = calibrate(DENSE, markers, priors=Priors(offset=OFFSET))
+    found = fitted(markers)
     before, after = errors(clean, true), errors(found, true)
     for field, much in (("bone_lengths", 1e-3), ("offsets", 1e-3), ("angles", np.radians(2))):
         change = rms(getattr(after, field) - getattr(before, field))
@@ -225,9 +228,9 @@ def test_ghosts_and_gaps_hardly_change_the_hand(how: str) -> None:
 
 
 def test_moving_the_world_moves_the_wrist_and_nothing_else() -> None:
-    true, found = person(0), calibrated(0)
+    true, found = person(0), calibrated(0, DENSE, RATE)
     rotation, shift = turn([1, 2, 3], 2.0), np.array([1.0, -2.0, 0.5])
-    other = calibrate(DENSE, true.markers @ rotation.T + shift, priors=Priors(offset=OFFSET))
+    other = fitted(true.markers @ rotation.T + shift)
     np.testing.assert_allclose(other.angles, found.angles, atol=5e-3)
     np.testing.assert_allclose(other.hand.skeleton, found.hand.skeleton, atol=1e-4)
     np.testing.assert_allclose(other.hand.offsets, found.hand.offsets, atol=1e-4)
@@ -237,16 +240,16 @@ def test_moving_the_world_moves_the_wrist_and_nothing_else() -> None:
 
 
 def test_calibration_is_deterministic() -> None:
-    again = calibrate(DENSE, person(1).markers, priors=Priors(offset=OFFSET))
-    np.testing.assert_array_equal(again.angles, calibrated(1).angles)
-    np.testing.assert_array_equal(again.hand.skeleton, calibrated(1).hand.skeleton)
+    again = fitted(person(1).markers)
+    np.testing.assert_array_equal(again.angles, calibrated(1, DENSE, RATE).angles)
+    np.testing.assert_array_equal(again.hand.skeleton, calibrated(1, DENSE, RATE).hand.skeleton)
 
 
 def test_frames_without_markers_follow_their_neighbours_and_say_so() -> None:
     markers = person(0).markers.copy()
     markers[100:110] = np.nan
     markers[150:160, 2:] = np.nan
-    found = calibrate(DENSE, markers, priors=Priors(offset=OFFSET))
+    found = fitted(markers)
     lost = np.zeros(FRAMES, bool)
     lost[100:110] = lost[150:160] = True
     np.testing.assert_array_equal(found.tracked, ~lost)
@@ -259,7 +262,7 @@ def test_frames_without_markers_follow_their_neighbours_and_say_so() -> None:
 
 def test_what_is_fixed_stays() -> None:
     true = person(2)
-    found = calibrate(true.hand, true.markers, fixed=("bones", "offsets"), noise=NOISE)
+    found = calibrate(true.hand, true.markers, rate=RATE, fixed=("bones", "offsets"), noise=NOISE)
     np.testing.assert_allclose(found.hand.skeleton, true.hand.skeleton, atol=1e-7)
     np.testing.assert_array_equal(found.hand.offsets, true.hand.offsets)
     assert not found.observed.bone_lengths.any()
@@ -271,7 +274,7 @@ def test_what_is_fixed_stays() -> None:
 
 
 def test_a_sparse_glove_says_what_it_cannot_see() -> None:
-    found = calibrated(0, GLOVE)
+    found = calibrated(0, GLOVE, RATE)
     assert not found.observed.bone_lengths[PIP_POINTS].any()
     assert found.hand.markers == GLOVE.markers
     assert np.isfinite(found.hand.skeleton).all()
@@ -281,8 +284,8 @@ def test_a_sparse_glove_says_what_it_cannot_see() -> None:
 
 
 def test_a_finger_is_seen_once_it_has_moved() -> None:
-    assert np.mean([calibrated(i).seen for i in range(PEOPLE)]) > 0.8
-    still = calibrate(DENSE, person(0, still=True).markers[:60], priors=Priors(offset=OFFSET))
+    assert np.mean([calibrated(i, DENSE, RATE).seen for i in range(PEOPLE)]) > 0.8
+    still = fitted(person(0, still=True).markers[:60])
     assert not still.seen.any()
 
 
@@ -292,7 +295,7 @@ def test_a_new_glove_is_found_from_another_one() -> None:
     like = like.with_skeleton(DENSE.skeleton)
     order = random.permutation(19)
     names = [DENSE.markers[i] for i in order]
-    found = new_hand(like, names, true.markers[:, order], name="mine")
+    found = new_hand(like, names, true.markers[:, order], rate=RATE, name="mine")
     assert found.name == "mine"
     assert found.markers == DENSE.markers
     assert rms(found.offsets - true.hand.offsets) < 0.6 * rms(like.offsets - true.hand.offsets)

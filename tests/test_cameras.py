@@ -324,11 +324,10 @@ def test_a_marker_is_followed_until_too_few_see_it_and_found_by_more() -> None:
     np.testing.assert_array_equal(plain, seen[:, 0] >= 2)
 
 
-def test_drop_outs_come_as_often_and_last_as_long_as_they_are_told() -> None:
-    what = Spells(0.5, 0.1, 0.5)
-    run = jax.jit(lambda key: cameras.spells(key, what, 6000, RATE, (40, 5)))
-    inside, began = map(np.asarray, run(jax.random.key(0)))
-    assert inside.shape == (40, 6000, 5)
+def test_spells_come_as_often_and_last_as_long_as_they_are_told() -> None:
+    run = jax.jit(lambda key, what: cameras.spells(motion.uniform(key, (40, 6000, 5)), what, RATE))
+    inside, began = map(np.asarray, run(jax.random.key(0), Spells(0.5, 0.1, 0.5)))
+    assert inside.shape == began.shape == (40, 6000, 5)
     begins = (began[:, 1:] != began[:, :-1]).sum()
     assert begins == pytest.approx(0.5 * 40 * 5 * 50, rel=0.05)
     rows = np.pad(np.moveaxis(inside, 1, -1), [(0, 0), (0, 0), (1, 1)]).astype(np.int8)
@@ -337,9 +336,19 @@ def test_drop_outs_come_as_often_and_last_as_long_as_they_are_told() -> None:
     # A few run into each other, which makes them longer.
     assert np.median(length) == pytest.approx(0.1, rel=0.15)
     assert np.quantile(length, 0.9) == pytest.approx(0.3, rel=0.25)
-    assert (began[inside] > 0).mean() > 0.9
-    silent, _ = cameras.spells(jax.random.key(0), Spells(0.0, 0.1, 0.5), 100, RATE, (3,))
+    silent, _ = run(jax.random.key(0), Spells(0.0, 0.1, 0.5))
     assert not np.asarray(silent).any()
+
+
+def test_no_spell_begins_in_the_first_frame_and_each_knows_when_it_did() -> None:
+    draws = np.full((9, 2), 0.999, np.float32)
+    chance = 2.0 / RATE
+    draws[0], draws[2, 1], draws[6, 1] = 0, 0.5 * chance, 0.5 * chance  # median length
+    inside, began = cameras.spells(draws, Spells(2.0, 3 / RATE, 0.5), RATE)
+    assert not np.asarray(inside)[:, 0].any()
+    np.testing.assert_array_equal(np.asarray(inside)[:, 1], [0, 0, 1, 1, 1, 0, 1, 1, 1])
+    np.testing.assert_array_equal(np.asarray(began)[:, 1], [0, 0, 2, 2, 2, 2, 6, 6, 6])
+    assert not np.asarray(began)[:, 0].any()
 
 
 # -- wrong positions ---------------------------------------------------------------------------

@@ -11,9 +11,9 @@ import pytest
 
 jax = pytest.importorskip("jax")
 
-from simulated import motion, quickly, worn  # noqa: E402
+from simulated import bones, motion, worn  # noqa: E402
 
-from jaxhand import dense_truth, simulation  # noqa: E402
+from jaxhand import dense_truth  # noqa: E402
 from jaxhand.datasets import load  # noqa: E402
 from jaxhand.dense_truth import PersonTruth  # noqa: E402
 from jaxhand.sequences import Dataset, Sequence  # noqa: E402
@@ -41,8 +41,7 @@ def person() -> tuple[Hand, Array, Array]:
     `[TAKES, FRAMES, 21, 3]`."""
     random = np.random.default_rng(0)
     offsets = DENSE.offsets + OFFSET * random.normal(size=DENSE.offsets.shape)
-    bones = quickly(simulation.bone_lengths, static_argnums=1)(jax.random.key(3), DENSE)
-    own = replace(DENSE, offsets=offsets).with_skeleton(np.asarray(bones))
+    own = replace(DENSE, offsets=offsets).with_skeleton(bones(3, DENSE))
     move = motion(4, FRAMES, 60.0, (TAKES,))
     angles, rotation, position = (array.astype(np.float64) for array in move)
     turns = rotations_from_angles(angles)

@@ -73,7 +73,7 @@ def recorded(frames: int = 240, seed: int = 0) -> tuple[Hand, Array, Array, Arra
     """The first frames of one minute: a person's hand, angles `[T, 26]`, a glove's rotations, all
     markers `[T, 9, 3]` and which are seen `[T, 9]`."""
     s = jax.tree.map(lambda array: np.asarray(array)[0], minute()(jax.random.key(seed)))
-    hand = GLOVE.with_skeleton(s.skeleton)
+    hand = replace(GLOVE, offsets=s.offsets).with_skeleton(s.skeleton)
     angles, *pose = (array[:frames] for array in (s.angles, s.wrist_rotation, s.wrist_position))
     markers = world(hand, rotations_from_angles(angles.astype(np.float64)), *pose)[1]
     return hand, angles, gloved(angles, 0.5, 5), markers, s.visible[:frames]

@@ -68,6 +68,20 @@ def test_shapes() -> None:
         assert shape(batch) == [(*batch, 7, 26), (*batch, 7, 3, 3), (*batch, 7, 3)]
 
 
+def test_it_goes_through_the_postures_that_it_is_given_and_rests_in_the_last() -> None:
+    flat, open_hand = np.zeros(26), 0.4 * motion.RELEASE  # nothing is in the way between these
+    postures = np.array([[flat, open_hand, flat], [open_hand, flat, open_hand], [flat] * 3])
+    postures = postures.astype(np.float32)
+    draw = quickly(lambda key: motion.motion(key, 900, RATE, (3,), postures=postures).angles)
+    angles = np.asarray(draw(jax.random.key(0)))
+    shaken = motion.TREMOR + motion.SWAY
+    assert (angles > postures.min(1, keepdims=True) - shaken).all()
+    assert (angles < postures.max(1, keepdims=True) + shaken).all()
+    for each, given in zip(angles, postures, strict=True):
+        np.testing.assert_allclose(each[[0, -1]], given[[0, -1]], atol=shaken)
+        assert np.abs(each - given[1]).max(-1).min() < shaken
+
+
 def test_angles_stay_in_their_ranges() -> None:
     for angles in (moved()[0].angles, postures()):
         assert (angles >= LOW - 1e-5).all()
@@ -114,6 +128,9 @@ def test_nothing_jumps_and_nothing_is_faster_than_a_hand() -> None:
     assert np.quantile(speed, 0.999) < 2.5
     assert speed.max() < 4.5
     assert 0.005 < np.median(speed) < 0.05
+    change = np.abs(np.diff(speed, axis=1))
+    assert np.quantile(change, 0.9999) < 1.0
+    assert change.max() < 2.0
     wrist = np.linalg.norm(np.diff(move.wrist_position, axis=1), axis=-1) * RATE
     assert wrist.max() < 3
     turn = np.einsum("ntij,ntij->nt", move.wrist_rotation[:, 1:], move.wrist_rotation[:, :-1])
@@ -123,6 +140,7 @@ def test_nothing_jumps_and_nothing_is_faster_than_a_hand() -> None:
 def test_the_wrist_stays_in_the_room() -> None:
     move, _ = moved()
     assert np.abs(move.wrist_position.mean((0, 1)) - motion.HOME).max() < 0.1
+    assert np.abs(move.wrist_position - np.array(motion.HOME)).max() < 1
     turned = np.swapaxes(move.wrist_rotation, -1, -2) @ move.wrist_rotation
     np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-5)
 

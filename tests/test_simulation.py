@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,14 +13,18 @@ jax = pytest.importorskip("jax")
 from simulated import quickly  # noqa: E402
 
 from jaxhand import simulation  # noqa: E402
-from jaxhand.motion import HOME  # noqa: E402
+from jaxhand.anthropometry import PLACEMENT  # noqa: E402
 from jaxhand.simulation import Streams  # noqa: E402
-from numpy_infer.hand import ANGLES, JOINTS, PARENTS, POINTS, TIPS, load_hand  # noqa: E402
+from numpy_infer.hand import ANGLES, PARENTS, POINTS, load_hand  # noqa: E402
+from numpy_infer.skeleton import (  # noqa: E402
+    forward_kinematics,
+    marker_positions,
+    rotations_from_angles,
+)
 
 RATE, COUNT, LENGTH = 60.0, 32, 900
 GLOVE = load_hand("glove9")
 NAMES = [angle.name for angle in ANGLES]
-TIP_POINTS = [POINTS.index(tip) for tip in TIPS]
 
 
 @functools.cache
@@ -42,9 +47,11 @@ def frames() -> tuple[np.ndarray, np.ndarray]:
     return jax.tree.map(np.asarray, compiled("frames")(jax.random.key(0)))
 
 
-def in_hand_frame(points: np.ndarray) -> np.ndarray:
-    s = streams()
-    return np.einsum("ntmi,ntij->ntmj", points - s.wrist_position[:, :, None], s.wrist_rotation)
+def of_both(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Markers `[N, M, 3]` and angles `[N, 26]` of all streams, or of the frames."""
+    if name == "frames":
+        return frames()
+    return streams().markers.reshape(-1, len(GLOVE), 3), streams().angles.reshape(-1, len(ANGLES))
 
 
 def gap_seconds(visible: np.ndarray) -> np.ndarray:
@@ -71,6 +78,7 @@ def test_shapes_and_precision() -> None:
     assert s.visible.dtype == bool
     assert s.angles.shape == (COUNT, LENGTH, len(ANGLES))
     assert s.positions.shape == (COUNT, LENGTH, len(POINTS), 3)
+    assert s.offsets.shape == (COUNT, markers, 3)
     assert s.time[-1] == pytest.approx((LENGTH - 1) / RATE)
     assert {a.dtype for a in s if a.dtype != bool} == {np.dtype(np.float32)}
     assert frames()[0].shape == (20000, markers, 3)
@@ -84,27 +92,31 @@ def test_bones_keep_their_length() -> None:
     np.testing.assert_allclose(bones, np.broadcast_to(own[:, None], bones.shape), atol=2e-6)
 
 
-def test_people_differ_in_size_and_a_little_in_proportion() -> None:
-    draw = quickly(lambda key: simulation.bone_lengths(key, GLOVE, (4000,)))
-    skeletons = np.asarray(draw(jax.random.key(0)))
-    scale = np.log(np.linalg.norm(skeletons[:, 1:], axis=-1) / np.array([*_lengths()]))
-    assert scale.mean(1).std() == pytest.approx(simulation.PERSON_SPREAD, rel=0.1)
-    single = (scale - scale.mean(1, keepdims=True)).std()
-    assert single == pytest.approx(simulation.BONE_SPREAD, rel=0.1)
-    directions = skeletons[:, 1:] / np.linalg.norm(skeletons[:, 1:], axis=-1, keepdims=True)
-    flat = GLOVE.skeleton[1:] / np.array([*_lengths()])[:, None]
-    np.testing.assert_allclose(directions, np.broadcast_to(flat, directions.shape), atol=1e-5)
+def test_markers_and_joints_are_those_of_the_bones_places_and_angles() -> None:
+    s = streams()
+    for person in (0, COUNT - 1):
+        hand = replace(GLOVE, offsets=s.offsets[person])
+        turns = rotations_from_angles(s.angles[person])
+        wrist = s.wrist_rotation[person], s.wrist_position[person]
+        points, rotations = forward_kinematics(s.skeleton[person], turns, *wrist)
+        np.testing.assert_allclose(s.positions[person], points, atol=3e-6)
+        markers = marker_positions(hand, points, rotations)
+        np.testing.assert_allclose(s.markers[person], markers, atol=3e-6)
 
 
-def _lengths() -> list[float]:
-    return list(GLOVE.bone_lengths.values())
+def test_everybody_has_bones_and_marker_places_of_their_own() -> None:
+    s = streams()
+    assert len(np.unique(s.skeleton[:, 1], axis=0)) == COUNT
+    off = np.linalg.norm(s.offsets - GLOVE.offsets, axis=-1)
+    assert 0.5 * PLACEMENT < off.mean(0).min() < off.mean(0).max() < 5 * PLACEMENT
 
 
-def test_angles_stay_in_their_ranges() -> None:
+@pytest.mark.parametrize("name", ["streams", "frames"])
+def test_angles_stay_in_their_ranges(name: str) -> None:
     low, high = np.radians([angle.range_deg for angle in ANGLES]).T
-    for angles in (streams().angles, frames()[1]):
-        assert (angles >= low - 1e-5).all()
-        assert (angles <= high + 1e-5).all()
+    _, angles = of_both(name)
+    assert (angles >= low - 1e-5).all()
+    assert (angles <= high + 1e-5).all()
 
 
 def test_postures_are_those_of_a_hand() -> None:
@@ -121,44 +133,16 @@ def test_postures_are_those_of_a_hand() -> None:
     assert np.degrees(twists).std() < 4
 
 
-def test_flat_hands_fists_and_pinches_occur() -> None:
-    s = streams()
-    column = dict(zip(NAMES, np.degrees(s.angles).reshape(-1, len(ANGLES)).T, strict=True))
+@pytest.mark.parametrize("name", ["streams", "frames"])
+def test_flat_hands_fists_and_pinches_occur(name: str) -> None:
+    markers, angles = of_both(name)
+    column = dict(zip(NAMES, np.degrees(angles).T, strict=True))
     flexions = [column[f"{f}_pip_flexion"] for f in ("index", "middle", "ring", "pinky")]
     flat, fist = np.max(flexions, 0) < 20, np.min(flexions, 0) > 85
-    thumb, index = (s.positions[:, :, POINTS.index(f"{f}_tip")] for f in ("thumb", "index"))
+    thumb, index = (markers[:, GLOVE.markers.index(f"{f}_tip")] for f in ("thumb", "index"))
     pinch = np.linalg.norm(thumb - index, axis=-1) < 0.02
     for share in (flat.mean(), fist.mean(), pinch.mean()):
         assert 0.02 < share < 0.4
-
-
-def test_nothing_jumps_and_nothing_is_faster_than_a_hand() -> None:
-    s = streams()
-    tips = in_hand_frame(s.positions[:, :, TIP_POINTS])
-    tip_speed = np.linalg.norm(np.diff(tips, axis=1), axis=-1) * RATE
-    assert tip_speed.max() < 3.2
-    assert np.median(tip_speed) > 0.01
-    wrist_speed = np.linalg.norm(np.diff(s.wrist_position, axis=1), axis=-1) * RATE
-    assert wrist_speed.max() < 3
-    turn = np.einsum("ntij,ntij->nt", s.wrist_rotation[:, 1:], s.wrist_rotation[:, :-1])
-    assert (np.arccos(np.clip((turn - 1) / 2, -1, 1)) * RATE).max() < 12
-    # The fastest move takes 12 frames: its speed changes by less than a third from one to the next.
-    assert np.abs(np.diff(tip_speed, axis=1)).max() < 1.0
-
-
-def test_the_wrist_stays_in_the_room() -> None:
-    s = streams()
-    assert np.abs(s.wrist_position.mean((0, 1)) - HOME).max() < 0.1
-    assert np.abs(s.wrist_position - np.array(HOME)).max() < 1
-    turned = np.swapaxes(s.wrist_rotation, -1, -2) @ s.wrist_rotation
-    np.testing.assert_allclose(turned, np.broadcast_to(np.eye(3), turned.shape), atol=1e-5)
-
-
-def test_markers_on_the_wrist_follow_it_rigidly() -> None:
-    s = streams()
-    rigid = [JOINTS[link] == "wrist" for link in GLOVE.links]
-    local = in_hand_frame(s.markers[:, :, rigid])
-    np.testing.assert_allclose(local, np.broadcast_to(local[:, :1], local.shape), atol=5e-6)
 
 
 def test_gaps_are_short_with_a_heavy_tail() -> None:
@@ -182,6 +166,22 @@ def test_several_markers_are_hidden_at_once_now_and_then() -> None:
     assert (hidden.max(1) < len(GLOVE)).any()
 
 
+def test_sequences_are_the_streams_without_their_gaps() -> None:
+    found = simulation.sequences(streams())
+    assert len({s.take for s in found}) == COUNT
+    for sequence, markers in zip(found, streams().markers, strict=True):
+        assert sequence.rate == RATE
+        np.testing.assert_array_equal(sequence.markers, markers)
+
+
+def test_still_markers_are_the_hands_own_at_rest() -> None:
+    angles = frames()[1][:50]
+    found = quickly(lambda angles: simulation.still_markers(GLOVE, GLOVE.skeleton, angles))(angles)
+    turns = rotations_from_angles(np.float64(angles))
+    points = forward_kinematics(GLOVE.skeleton, turns, np.eye(3), np.zeros(3))
+    np.testing.assert_allclose(found, marker_positions(GLOVE, *points), atol=1e-6)
+
+
 def test_vmap_draws_one_hand_for_each_key() -> None:
     keys = jax.random.split(jax.random.key(3), 3)
     many = quickly(jax.vmap(simulation.poses))(keys)
@@ -191,11 +191,6 @@ def test_vmap_draws_one_hand_for_each_key() -> None:
     def shape(function) -> list[tuple[int, ...]]:
         return [a.shape for a in jax.tree.leaves(jax.eval_shape(jax.vmap(function), keys))]
 
-    assert shape(lambda key: simulation.motion(key, 30, RATE)) == [
-        (3, 30, len(ANGLES)),
-        (3, 30, 3, 3),
-        (3, 30, 3),
-    ]
     assert shape(lambda key: simulation.gaps(key, 30, 9, RATE)) == [(3, 30, 9)]
-    assert shape(lambda key: simulation.bone_lengths(key, GLOVE)) == [(3, len(POINTS), 3)]
     assert shape(lambda key: simulation.frames(key, GLOVE, 5))[0] == (3, 5, len(GLOVE), 3)
+    assert shape(lambda key: simulation.streams(key, GLOVE, 5, 7))[0] == (3, 5, 7, len(GLOVE), 3)
