@@ -220,8 +220,8 @@ class HandTracker:
     ) -> HandTracker:
         """A tracker that runs a model file or, by its name, a bundled model (`model.bundled`), for
         whoever a calibration file describes; with `alignment` fingers are turned towards their
-        markers, which takes half as long again; without `gate` every measurement is believed; with
-        `smoothing` what is given out jitters less and lags more, see `one_euro`.
+        markers, which takes a third as long again; without `gate` every measurement is believed;
+        with `smoothing` what is given out jitters less and lags more, see `one_euro`.
 
         Raises:
             ValueError: a file is not what it should be, or damaged; see `model.load` and
