@@ -274,7 +274,7 @@ def test_what_the_network_says_of_visible_markers_is_not_used_and_turns_with_the
 def test_predictors_take_any_leading_axes(data: st.DataObject) -> None:
     rng = np.random.default_rng(data.draw(seeds()))
     shape = (2, 3)
-    for name, (init, step, _) in PREDICTORS.items():
+    for name, (init, step, *_) in PREDICTORS.items():
         model = a_model(name)
         many, one = init(model, shape), init(model)
         last_many = np.broadcast_to(model.hand.template, (*shape, 9, 3))
