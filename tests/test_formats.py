@@ -318,7 +318,7 @@ def test_qualisys_may_lack_its_column_names_or_frame_and_time(put: Callable) -> 
 
 def test_plain_csv_without_a_unit_asks_for_it(put: Callable) -> None:
     path = put("take.csv", CSV.removeprefix("# unit: mm\n"))
-    with pytest.raises(ValueError, match="does not state its unit; pass unit="):
+    with pytest.raises(ValueError, match="does not state its unit; pass --unit METRES"):
         read(path)
     np.testing.assert_allclose(read(path, unit=1e-3).markers, MARKERS)
 

@@ -32,7 +32,7 @@ def agreed(path: Path, stated: float | None, given: float | None) -> float:
     metres = given if stated is None else stated
     if metres is None:
         raise ValueError(
-            f"{path}: the file does not state its unit; pass unit=METRES, the metres in one of "
-            "its units (0.001 for millimetres)"
+            f"{path}: the file does not state its unit; pass --unit METRES (in Python "
+            "unit=METRES), the metres in one of its units: 0.001 for millimetres"
         )
     return metres
