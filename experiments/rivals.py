@@ -4,7 +4,8 @@ Both networks of a model, in float32 on one thread, from a numpy array to a nump
 as a live tracker has it, and many at once. The rivals are given the weights with the scaling folded
 in, as `numpy_infer` runs them; `plain numpy` is the forward pass as anyone would write it. All run
 in one process, by turns, and again each in a loop of its own, with all of the cache: read the
-ratios. They need `pip install -e '.[bench]'`; what is not installed is left out.
+ratios. They need `pip install -e '.[bench]'`; onnxruntime and torch are left out where they are not
+installed.
 """
 
 from __future__ import annotations

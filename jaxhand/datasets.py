@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -140,7 +139,7 @@ def load(
         split: which of the default splits; without effect where `takes` are named.
         hand: the markers wanted; default the data set's own, see `SOURCES`.
         takes: instead of the split: takes (ManipNet), users (SIG18), file stems (the others).
-        unit, left_handed: for `recordings` whose files do not say, see `recordings.read`.
+        unit, left_handed: for `recordings` alone, where files do not say, see `recordings.read`.
         truth: fit joint truth to recordings that hold none but have the markers for it (SIG18;
             minutes for each user); a folder: and keep it there, or take it from there.
 
@@ -152,6 +151,8 @@ def load(
     if spec.name not in SOURCES:
         raise ValueError(f"no data set {spec.name!r}: expected one of {', '.join(SOURCES)}")
     source = SOURCES[spec.name]
+    if (unit is not None or left_handed) and spec.name != OWN:
+        raise ValueError(f"unit and left_handed are for {OWN}: files of {spec.name} are known")
     if spec.path is None or not spec.path.exists():
         missing = "no path given" if spec.path is None else f"{spec.path} does not exist"
         raise ValueError(f"{missing}: pass {spec.name}:PATH, {source.where}")
@@ -206,6 +207,9 @@ def _sequence(recording: Recording, hand: Hand, take: str, side: str) -> Sequenc
     markers = (mirror(markers) if side == "right" else markers).astype(np.float32)
     return Sequence(f"{take}/{side}", take, RATE, markers)
 
+
+OWN = "recordings"
+"""The data set that is whoever's own files."""
 
 SIG18_AS_GLOVE9 = {
     "PinkyMCP": "pinky_base",
@@ -470,7 +474,7 @@ SOURCES = {
         hand="qualisys13",
         files=_files("*.tsv", lambda path: path.stem),
         splits=lambda takes: {"test": takes},
-        read=partial(_measured, side="right"),
+        read=lambda paths, hand, _: _measured(paths, hand, Reading(), "right"),
         where="recording.tsv of a right hand from github.com/dfki-ric/hand_embodiment (BSD-3)",
     ),
     "pavllo": Source(
@@ -481,7 +485,7 @@ SOURCES = {
         where="a folder of out_mocap_TAKE.csv and out_fused_TAKE.csv as the paper's authors "
         "record them (github.com/dariopavllo/robust-finger-tracking)",
     ),
-    "recordings": Source(
+    OWN: Source(
         hand="glove9",
         files=_files("*", lambda path: path.stem),
         splits=_in_order,

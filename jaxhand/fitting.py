@@ -38,7 +38,7 @@ RANGE_PRIOR = 0.1
 tip lies aside, which hinges cannot express, from being twisted by 70°."""
 
 REST_EVERY, REST_ROUNDS = 10, 2
-"""Frames of a recording that the rest directions of its bones are taken from, and how often."""
+"""Every how many-th frame the bones' rest directions are taken from, and rounds of it."""
 
 _OF_FINGER = [[i for i, a in enumerate(ANGLES) if a.joint.startswith(f)] for f in FINGERS]
 _WIDTH = max(map(len, _OF_FINGER))
@@ -99,7 +99,8 @@ def fit_angles(skeleton: Array, points: Array, weight: Array | None = None) -> F
 
 def rest_directions(skeleton: Array, points: Array) -> Array:
     """`[21, 3]` metres: the skeleton with every bone beyond a finger's base laid as the joint that
-    carries it has it on average, lengths kept: no hinge is quite square to its bones.
+    carries it has it on average, lengths kept: no hinge is quite square to its bones. What the
+    angles' ranges hold back goes into the bones, too, so the recording should not be out of them.
 
     Args:
         skeleton: `[21, 3]` metres, each point from its parent in the flat hand.
@@ -113,8 +114,10 @@ def rest_directions(skeleton: Array, points: Array) -> Array:
     bones = points[:, carried] - points[:, carriers]
     laid = np.array(skeleton)
     for _ in range(REST_ROUNDS if len(points) else 0):
-        turns = rotations_from_angles(jnp.asarray(fit_angles(laid, points).angles))
-        _, rotations = forward_kinematics(jnp.asarray(laid, jnp.float32), turns)
+        angles = fit_angles(laid, points).angles
+        with jax.default_device(jax.local_devices(backend="cpu")[0]):
+            turns = rotations_from_angles(jnp.asarray(angles))
+            _, rotations = forward_kinematics(jnp.asarray(laid, jnp.float32), turns)
         own = (bones[..., None, :] @ np.asarray(rotations)[:, carriers])[..., 0, :].mean(0)
         lengths = np.linalg.norm(laid[carried], axis=-1) / np.linalg.norm(own, axis=-1)
         laid[carried] = own * lengths[:, None]

@@ -255,7 +255,7 @@ def motion(
         rate: frames per second.
         batch: leading shape.
         people: `[...]` who moves, of shape `batch`; by default the mean person.
-        postures: `[..., K, 26]` radians: what they move between, one of them after the other; by
+        postures: `[..., K, 26]` radians, two or more: what they move between, one after another; by
             default `stops`. After the last of them, for which `enough` has a number, they rest.
     """
     people = mean_person(load_hand("glove9")) if people is None else people

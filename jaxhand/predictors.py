@@ -200,7 +200,7 @@ def predicted_markers(model: Model, registered: Array, visible: Array) -> Array:
     Args:
         model: its marker network is run.
         registered: `[..., M, 3]` metres, registered frame.
-        visible: `[..., M]`.
+        visible: what broadcasts to `[..., M]`.
 
     Returns:
         `[..., M, 3]` metres, registered frame: what it says of all markers.

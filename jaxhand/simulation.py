@@ -1,7 +1,7 @@
 """Frames and recordings of hands out of a random key, to train on before there are real ones.
 
 Everything is a canonical left hand in metres, seconds and radians, float32. The same key gives the
-same result; every function is pure, and safe under jit and vmap.
+same result; every function but `sequences` is pure, and safe under jit and vmap.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def gaps(key: Array, frames: int, markers: int, rate: float, batch: tuple[int, .
     own, obstacle, share, hides = jnp.split(draws, (markers, markers + 1, markers + 2), -1)
     lost, _ = spells(own, GAPS, rate)
     behind, began = spells(obstacle, OBSTACLES, rate)
-    # An obstacle hides the same markers as long as it is there.
+    # An obstacle hides the same markers until it is gone or the next one comes.
     hides = jnp.take_along_axis(hides < share, began, -2)
     return ~(lost | (behind & hides))
 
@@ -157,11 +157,11 @@ def streams(key: Array, hand: Hand, count: int, frames: int, rate: float = RATE)
     )
 
 
-def sequences(streams: Streams) -> list[Sequence]:
+def sequences(recorded: Streams) -> list[Sequence]:
     """Streams at 60 Hz without their gaps, as evaluations take them."""
     return [
         Sequence(f"person {i}", f"person {i}", RATE, markers)
-        for i, markers in enumerate(np.asarray(streams.markers))
+        for i, markers in enumerate(np.asarray(recorded.markers))
     ]
 
 

@@ -279,7 +279,7 @@ def fit_networks(
     Args:
         training, validation: frames; both with angles where a joint network is wanted.
         hand: markers are registered to its template, and angles move its skeleton.
-        config: of which `data`, `out`, `hand` and the takes are not read.
+        config: what it says of which data to read, and how, is not looked at.
         report: called after every epoch.
         folder: where metrics and checkpoints are kept and, if there are any, gone on from; None
             keeps nothing.

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxhand import simulation
-from jaxhand.datasets import Split, load, parse_spec
+from jaxhand.datasets import OWN, Split, load, parse_spec
 from jaxhand.expected_error import people
 from jaxhand.occlusions import FEWEST_LEFT
 from jaxhand.sequences import Dataset, Sequence
@@ -125,18 +125,12 @@ def _load(config: TrainingConfig, split: Split, start: Model | None) -> list[Dat
     takes = config.train if split == "train" else config.validation
     truth = config.truth or False
     recorded = [spec for spec in config.data if parse_spec(spec).name != SIMULATED]
-    datasets = [
-        load(
-            spec,
-            split,
-            hand=hand,
-            takes=takes or None,
-            unit=config.unit,
-            left_handed=config.left_handed,
-            truth=truth,
-        )
-        for spec in recorded
-    ]
+    said: dict[str, Any] = {"unit": config.unit, "left_handed": config.left_handed}
+    datasets = []
+    for spec in recorded:
+        # Beside others, it is the recordings that this is said of.
+        own = said if parse_spec(spec).name == OWN or len(recorded) == 1 else {}
+        datasets.append(load(spec, split, hand=hand, takes=takes or None, truth=truth, **own))
     for dataset in datasets[1:]:
         if dataset.hand.markers != datasets[0].hand.markers:
             raise ValueError(

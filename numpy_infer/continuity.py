@@ -28,6 +28,7 @@ from numpy_infer.geometry import (
     transform,
     untransform,
 )
+from numpy_infer.hand import Hand
 from numpy_infer.model import Model
 from numpy_infer.output import leading, wrist_pose
 from numpy_infer.pose import DETERMINED_EXTENT, State
@@ -73,8 +74,11 @@ def advance(
 
 def together(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State | None:
     """The states, an axis in front or 1 in its place, after each of several frames of one visible
-    set `[T, ..., M]`; None if they are not all steady, or not quiet for the gate. While the set
-    stays, a correction depends on the time since, not on the frames between."""
+    set `[T, ..., M]`, which the caller sees to; None if they are not all steady, or not quiet for
+    the gate. While the set stays, a correction depends on the time since, not on the frames
+    between."""
+    if np.count_nonzero(state.tracking) < state.tracking.size:
+        return None
     own = gate.quietly(state.gate, markers, visible, dt) if model.gate else state.gate
     if own is None:
         return None
@@ -164,7 +168,7 @@ def _steady(
     if np.count_nonzero(visible != state.visible) or np.count_nonzero(tracking) < tracking.size:
         return None
     rotations, translations, second = fit(
-        _patterns(model, markers.dtype.char, visible.shape, visible.tobytes()),
+        _patterns(model.hand, model.body, markers.dtype.char, visible.shape, visible.tobytes()),
         markers,
         lambda: np.stack(
             np.broadcast_arrays(_carried_prior(state, markers, weight), state.rotation)
@@ -210,13 +214,13 @@ def _steady(
 
 
 @lru_cache(maxsize=64)
-def _patterns(model: Model, dtype: str, shape: tuple[int, ...], seen: bytes) -> Pattern:
+def _patterns(hand: Hand, body: Hand, dtype: str, shape: tuple[int, ...], seen: bytes) -> Pattern:
     """What a visible set `[..., M]` is registered to, frame after frame: the template by its
     markers and, for the wrist's pose, the body's by the alignment markers."""
     visible = np.frombuffer(seen, bool).reshape(shape)
     weights = np.empty((2, *shape), dtype)
-    weights[0], weights[1] = visible, model.hand.alignment_weight
-    templates = np.array([model.hand.template, model.body.template], dtype)
+    weights[0], weights[1] = visible, hand.alignment_weight
+    templates = np.array([hand.template, body.template], dtype)
     return pattern(templates.reshape(2, *(1,) * (len(shape) - 1), *templates.shape[1:]), weights)
 
 
@@ -244,17 +248,25 @@ def _unsteady(
         carried = _carried_prior(state, markers, weight)
         return np.stack([np.where(changed[..., None, None], state.rotation, carried), followed])
 
-    found = fit(pattern(template, weight), np.stack([markers, previous]), priors)
-    start = mean_point(markers, weight) - mean_point(template, weight)
-    start = np.where(visible.any(-1, keepdims=True), start, state.translation)
-    moved = np.where(state.tracked[..., None], state.translation + shift, start)
+    rotations, translations, _ = fit(
+        pattern(template, weight), np.stack([markers, previous]), priors
+    )
     sure, tracked = tracking[..., None, None], state.tracked[..., None, None]
-    rotations = np.where(sure, found[0], state.rotation)
-    translations = np.where(tracking[..., None], found[1], np.stack([moved, state.translation]))
+    certain = np.count_nonzero(tracking & state.tracked) == tracking.size
+    if not certain:
+        start = mean_point(markers, weight) - mean_point(template, weight)
+        start = np.where(visible.any(-1, keepdims=True), start, state.translation)
+        moved = np.where(state.tracked[..., None], state.translation + shift, start)
+        moved = np.stack([moved, state.translation])
+        rotations = np.where(sure, rotations, state.rotation)
+        translations = np.where(tracking[..., None], translations, moved)
     now, then = ((rotations[i], translations[i]) for i in (0, 1))
-    # Before there was any output the template stands in for it.
-    placed = transform(*now, template)
-    last = np.where(tracked, state.output, placed)
+    last = held = state.output
+    if not certain:
+        # Before there was any output the template stands in for it.
+        placed = transform(*now, template)
+        last = np.where(tracked, last, placed)
+        held = np.where(tracked, last + shift[..., None, :], placed)
 
     measured = untransform(rotations, translations, np.stack([markers, previous]))
     if PREDICTORS[model.predictor].of_frame is not None:
@@ -272,32 +284,36 @@ def _unsteady(
         _, again, *_ = _fill(
             model, state.predictor, measured[1], previous, visible, last, still, then, then
         )
-    held = np.where(tracked, last + shift[..., None, :], placed)
-    registered = np.where(sure | known, registered, untransform(*now, held))
-    raw = np.where(sure | known, raw, held)
+    correction = untransform(*then, last) - again
+    if not certain:
+        registered = np.where(sure | known, registered, untransform(*now, held))
+        raw = np.where(sure | known, raw, held)
+        correction = np.where(sure | known, correction, 0)
 
-    restart, begin = (changed & state.tracked)[..., None, None], ~tracked
-    correction = np.where(sure | known, untransform(*then, last) - again, 0)
     length = np.sqrt((correction * correction).sum(-1, keepdims=True))
     correction = np.where(length < FARTHEST_CORRECTION, correction, 0)
-    correction = np.where(begin, 0, np.where(restart, correction, state.correction))
-    anchor = np.where(begin, registered, np.where(restart, measured[1], state.anchor))
+    anchor, prior = measured[1], then[0].swapaxes(-1, -2) @ followed
     seen = untransform(*now, transform(turn, move, before))
-    seen = np.where(restart & sure, seen, state.seen)
-    followed = then[0].swapaxes(-1, -2) @ followed
-    prior = np.where(begin, now[0].swapaxes(-1, -2) @ state.rotation, state.prior)
-    gone = np.where(state.visible, 0, state.drift + state.change[..., None])
-    drift = np.where(changed[..., None], gone, state.drift)
+    drift = np.where(state.visible, 0, state.drift + state.change[..., None])
+    if not (certain and changed.all()):
+        # Hands whose set is the same go on as they were; those seen for the first time begin.
+        restart, begin = (changed & state.tracked)[..., None, None], ~tracked
+        correction = np.where(begin, 0, np.where(restart, correction, state.correction))
+        anchor = np.where(begin, registered, np.where(restart, anchor, state.anchor))
+        seen = np.where(restart & sure, seen, np.where(begin & ~known, template, state.seen))
+        at_first = now[0].swapaxes(-1, -2) @ state.rotation
+        prior = np.where(restart, prior, np.where(begin, at_first, state.prior))
+        drift = np.where(changed[..., None], drift, state.drift)
     drift = drift + np.where(tracking, 0, DRIFT_UNSEEN * dt)[..., None]
     drift = np.where(visible, 0, drift).astype(markers.dtype, copy=False)
     return _Frame(
         advance,
         tracking,
         *now,
-        np.where(begin & ~known, template, seen),
+        seen,
         correction,
         anchor,
-        np.where(restart, followed, prior),
+        prior,
         drift,
         registered,
         raw,

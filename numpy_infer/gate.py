@@ -253,7 +253,8 @@ def unquiet(markers: Array, visible: Array, dt: Array) -> Array:
     velocity = moved[:-1] / np.maximum(dt[1:-1], BRIEFEST)[..., None, None]
     told = (moved[1:] != 0).sum((-1, -2)) == 3 * visible[2:].sum(-1)
     alike = (visible[2:] == visible[1:-1]).all(-1)
-    quiet = told & alike & (_off(moved[1:], velocity, dt[2:]).max(-1) < QUIET**2)
+    quiet = told & alike & (dt[2:] > BRIEFEST)
+    quiet &= _off(moved[1:], velocity, dt[2:]).max(-1) < QUIET**2
     found = np.ones(len(markers), bool)
     found[2:] = ~quiet.all(tuple(range(1, quiet.ndim)))
     return found

@@ -67,7 +67,7 @@ class Model:
     """`[3M]` markers in the hand frame, metres → `[26]` radians; needed by the stage `learned`."""
     alignment: bool = False
     """Turn the fingers towards their markers after the joint network, see `skeleton`: nearer joints
-    for half as much time again, so a choice of whoever runs the model, not of its file."""
+    for a third as much time again, so a choice of whoever runs the model, not of its file."""
     gate: bool = False
     """Notice wrong measurements and treat them as hidden, see `gate`. Likewise a choice."""
     smoothing: Smoothing | None = None

@@ -130,13 +130,15 @@ def run(
             begins |= gate.unquiet(markers, visible, elapsed)
     starts = [*np.flatnonzero(begins), count]
     for start, end in pairwise(starts):
-        done = start
+        done, ahead = start, count
         while done < end:
-            frames = slice(done, end if done > start else start + 1)
+            frames = slice(done, min(done + ahead, end) if done > start else start + 1)
             several = frames.stop - done > 1
             states = several and together(
                 model, state, markers[frames], visible[frames], elapsed[frames]
             )
+            # After a refusal less is asked for, or a recording would be gone through endlessly.
+            ahead = 2 * ahead if states or not several else 2
             if not states:
                 frames = slice(done, done + 1)
                 one = markers[done], visible[done], elapsed[done], late[done]

@@ -42,8 +42,8 @@ from numpy_infer.skeleton import (  # noqa: E402
 )
 
 PEOPLE, FRAMES, RATE, NOISE = 16, 240, 30.0, 1e-3
-FOUR_SECONDS = 60.0
-"""The rate at which as many frames are half as long."""
+FAST_RATE = 60.0
+"""At which the frames are four seconds, not eight."""
 OFFSET = 2e-3
 """Metres per axis: how far off the markers are, and are said to be."""
 DENSE, GLOVE = load_hand("dense19"), load_hand("glove9")
@@ -136,7 +136,7 @@ def everyone(
 
 
 def test_dense_markers_give_first_bones_knuckle_angles_and_middle_joints() -> None:
-    found = everyone(DENSE, 8, FOUR_SECONDS)
+    found = everyone(DENSE, 8, FAST_RATE)
     first = [error.bone_lengths[PIP_POINTS] for _, error, _ in found]
     assert rms(first) < 2e-3
     assert np.degrees(rms([error.angles[:, MCP] for _, error, _ in found])) < 3
@@ -193,7 +193,7 @@ def everywhere() -> Hand:
 def test_a_marker_on_every_phalanx_gives_all_joints() -> None:
     """All angles but for a constant each, which is where the markers sit: 2 mm are 9° of a last
     phalanx."""
-    found = everyone(everywhere(), 4, FOUR_SECONDS)
+    found = everyone(everywhere(), 4, FAST_RATE)
     assert rms([error.bone_lengths for _, error, _ in found]) < 2e-3
     assert np.degrees(rms([error.angles[:, MCP + PIP] for _, error, _ in found])) < 3
     assert rms([off[:, : len(JOINTS)] for _, _, off in found]) < 2e-3

@@ -184,7 +184,7 @@ def test_a_command_writes_its_table_and_its_picture(
     assert (tmp_path / "t3.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_what_files_do_not_say_can_be_said(tmp_path: Path) -> None:
+def test_what_files_do_not_say_can_be_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Left-handed millimetres of which the file says nothing, to train on and to test on."""
     take = tmp_path / "one.csv"
     markers = wriggling(70, 0).markers
@@ -196,14 +196,20 @@ def test_what_files_do_not_say_can_be_said(tmp_path: Path) -> None:
     names = {"train": ("one",), "validation": ("one",), "hand": "glove9"}
     given = collect(TrainingConfig(**of, **names, out=tmp_path / "run"))
     np.testing.assert_allclose(given.training.markers, markers, atol=1e-6)
-    config = report.EvaluationConfig(**of, test=("one",), model="affine", seeds=1)
-    found = report.evaluate(config, Console(quiet=True))["table3"]["affine"]["2"]["0.1"]
-    sequence = Sequence("one/left", "one", 60.0, markers.astype(np.float32))
-    metres = {"affine": Model(HAND, "affine")}
-    expected = evaluation.table3(metres, [sequence], seeds=1)["affine"]["2"]["0.1"]
-    assert found["mean"] == pytest.approx(expected["mean"], rel=1e-4)
-    with pytest.raises(ValueError, match="unit"):
+
+    tested = []
+    monkeypatch.setattr(
+        report, "_markers_report", lambda model, dataset, *_: tested.append(dataset) or {}
+    )
+    config = report.EvaluationConfig(**of, test=("one",), model="affine")
+    report.evaluate(config, Console(quiet=True))
+    np.testing.assert_allclose(tested[0].sequences[0].markers, markers, atol=1e-6)
+    with pytest.raises(ValueError, match="does not state its unit"):
         report.evaluate(replace(config, unit=None), Console(quiet=True))
+    for said in ({"unit": 1e-3}, {"left_handed": True}):
+        known = report.EvaluationConfig(data=(f"sig18:{tmp_path}",), **said)
+        with pytest.raises(ValueError, match="are for recordings: files of sig18 are known"):
+            report.evaluate(known, Console(quiet=True))
 
 
 def test_the_printed_table_holds_the_figures() -> None:

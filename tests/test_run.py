@@ -107,3 +107,23 @@ def test_in_jax_too() -> None:
     assert_allclose(ran[1].markers, ours[1].markers, rtol=0, atol=1e-4)
     assert_allclose(ran[0].drift, ours[0].drift, rtol=0, atol=1e-4)
     assert_allclose(ran[1].expected_error, ours[1].expected_error, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("seen", [0, 2, 9])
+def test_a_recording_is_not_gone_through_again_and_again(
+    seen: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether a hand is there, hardly or not at all: each frame is asked of a few times at most."""
+    model = a_model("learned", gate=True)
+    markers = motion(model.hand, np.random.default_rng(0), 300, 2) / 3
+    visible = np.ones(markers.shape[:-1], bool)
+    visible[20:, 1, seen:] = False
+    asked, together = [], tracker.together
+
+    def counted(model: Model, state: State, markers: Array, *rest: Array) -> State | None:
+        asked.append(len(markers))
+        return together(model, state, markers, *rest)
+
+    monkeypatch.setattr(tracker, "together", counted)
+    tracker.run(model, tracker.init(model, (2,)), markers, visible, np.full((300, 2), 1 / 60))
+    assert sum(asked) < 4 * len(markers)
