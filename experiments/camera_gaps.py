@@ -25,6 +25,7 @@ import numpy as np
 
 from jaxhand.anthropometry import People, people
 from jaxhand.cameras import Rig, film
+from jaxhand.compiled import compiled
 from jaxhand.occlusions import QUANTILES, Occlusions, bins, statistics
 from jaxhand.two_hands import two_hands
 from numpy_infer.arrays import Array
@@ -68,11 +69,11 @@ def main() -> None:
     person_key, motion_key, key = jax.random.split(jax.random.key(options.seed), 3)
     frames, batch = round(RATE * options.seconds), (options.recordings,)
     person = people(person_key, hand, batch)
-    motions = jax.jit(two_hands, static_argnums=(1, 2, 3))(
+    motions = compiled(two_hands, static_argnums=(1, 2, 3))(
         motion_key, frames, RATE / PACE, batch, person
     )
 
-    @partial(jax.jit, static_argnames="cameras")
+    @partial(compiled, static_argnames="cameras")
     def run(key: Array, person: People, motions: Any, rig: Rig, cameras: int) -> Any:
         return film(key, hand, person, *motions, RATE, rig._replace(cameras=cameras))
 

@@ -24,6 +24,7 @@ from jaxhand import simulation, tasks, training
 from jaxhand import tracker as jax_tracker
 from jaxhand.anthropometry import people
 from jaxhand.cameras import Rig, film
+from jaxhand.compiled import compiled
 from jaxhand.joints import joint_stage
 from jaxhand.networks import predict
 from jaxhand.sparse_fit import least_squares, prior_of
@@ -180,7 +181,7 @@ def print_offline(model: Model, rounds: int, frames: int = 2048, hands: int = 64
     one = np.array(markers[:, 0], np.float64), visible[:, 0], np.full(frames, 1 / 60)
     full = one[0], np.ones_like(one[1]), one[2]
     features = markers[some].reshape(-1, hands, 3 * len(model.hand))
-    run = jax.jit(lambda state, *arrays: jax_tracker.run(model, state, *arrays)[1])
+    run = compiled(lambda state, *arrays: jax_tracker.run(model, state, *arrays)[1])
     start, both = jax_tracker.init(model, (hands,)), jax.jit(networks)
     runs: dict[str, Callable[[], Any]] = {
         "numpy, gaps": lambda: tracker.run(model, tracker.init(model), *one),
@@ -203,7 +204,7 @@ def print_simulator(rounds: int, frames: int = 600, scenes: int = 16) -> None:
     hand = load_hand("glove9")
     person = people(jax.random.key(5), hand, (scenes,))
 
-    @jax.jit
+    @compiled
     def bare(key: Array) -> Any:
         moves = two_hands(key, frames, 60.0, (scenes,), person)
         return [
@@ -211,7 +212,7 @@ def print_simulator(rounds: int, frames: int = 600, scenes: int = 16) -> None:
             for move, right in zip(moves, (False, True), strict=True)
         ]
 
-    @jax.jit
+    @compiled
     def filmed(key: Array) -> Any:
         moves = two_hands(key, frames, 60.0, (scenes,), person)
         return film(key, hand, person, *moves, 60.0, Rig(cameras=8))

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhand.anthropometry import People, placed
+from jaxhand.compiled import apart
 from jaxhand.contact import capsules
-from jaxhand.geometry import apart, mirror, mirror_rotation, product
+from jaxhand.geometry import mirror, mirror_rotation, product
 from jaxhand.motion import HOME, Motion, uniform
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array

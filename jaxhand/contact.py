@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhand.anthropometry import People
-from jaxhand.geometry import apart
+from jaxhand.compiled import apart
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, PARENTS, POINTS, Hand
 from numpy_infer.skeleton import EULER, JOINT_AXES, SIGNS

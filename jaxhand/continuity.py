@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxhand import gate
+from jaxhand.compiled import apart
 from jaxhand.geometry import (
-    apart,
     kabsch,
     mean_point,
     product,
@@ -26,7 +26,7 @@ from jaxhand.geometry import (
     transform,
     untransform,
 )
-from jaxhand.output import leading, wrist_pose
+from jaxhand.output import leading
 from jaxhand.predictors import PREDICTORS
 from numpy_infer.arrays import Array
 from numpy_infer.continuity import (
@@ -43,216 +43,207 @@ def advance(
     model: Model, state: State, markers: Array, visible: Array, dt: Array, late: Array
 ) -> State:
     """The state after a frame of clean input."""
+    # But for the wrist's pose, which nothing here needs.
     own, accepted = state.gate, visible
     if model.gate:
         own, accepted = gate.step(
             model, state.gate, markers, visible, state.output, state.tracked, dt
         )
         markers = jnp.where(accepted[..., None], markers, 0)
-    new_state = _track(model, state, markers, accepted, dt)
+    frame = _frame(model, state, markers, accepted, dt)
+    new_state = _blended(model, state, frame, markers, accepted, dt)
     new_state = new_state._replace(gate=own, rejected=visible & ~accepted)
     same = (accepted == state.visible).all(-1) & (markers == state.markers).all((-1, -2))
     return choose(late & state.known.any(-1) & same, state, new_state)
 
 
-def _track(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State:
-    """The state after a frame of clean input of a left hand."""
-    weight = visible.astype(markers.dtype)
-    template = jnp.asarray(model.hand.template, markers.dtype)
-    tracking = second_extent(markers, weight) > DETERMINED_EXTENT
-    both = visible & state.visible
-    shift = mean_point(markers - state.markers, both.astype(markers.dtype))
-    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
-    rotation, translation = apart(
-        _register(state, template, markers, weight, changed, tracking, shift)
-    )
-    # Before there was any output the template stands in for it.
-    placed = transform(rotation, translation, template)
-    last = jnp.where(state.tracked[..., None, None], state.output, placed)
-    redone = apart(
-        _redo(model, state, markers, visible, tracking, shift, last, rotation, translation)
-    )
-    before = _registration_before(state, redone, changed, rotation, translation)
-    advance, raw = apart(
-        _fill(model, state.predictor, markers, visible, last, dt, (rotation, translation), before)
-    )
-    held = jnp.where(state.tracked[..., None, None], last + shift[..., None, :], placed)
-    raw = jnp.where(tracking[..., None, None], raw, held)
-    raw = jnp.where(visible[..., None], markers, raw)
-    registered = apart(untransform(rotation, translation, raw))
-
-    correction, anchor, seen = state.correction, state.anchor, state.seen
-    restart = (changed & state.tracked)[..., None, None]
-    correction = jnp.where(restart, redone.correction, correction)
-    anchor = jnp.where(restart, redone.anchor, anchor)
-    seen = jnp.where((changed & tracking & state.tracked)[..., None, None], redone.seen, seen)
-    begin = ~state.tracked[..., None, None]
-    prior = jnp.where(restart, redone.prior, state.prior)
-    prior = jnp.where(begin, product(rotation.swapaxes(-1, -2), state.rotation), prior)
-    correction = jnp.where(begin, 0, correction)
-    anchor = jnp.where(begin, registered, anchor)
-    seen = jnp.where(begin & ~visible[..., None], template, seen)
-    seen = jnp.where(visible[..., None], registered, seen)
-    correction, anchor, seen = apart((correction, anchor, seen))
-
-    change = _change(anchor, registered, visible)
+def _blended(
+    model: Model, state: State, frame: _Frame, markers: Array, visible: Array, dt: Array
+) -> State:
+    """The state after a frame: the output, with corrections added."""
+    correction, output = frame.correction, frame.raw
+    change = _change(frame, visible)
     if model.continuity:
-        correction, blend = _blend(model, correction, change, visible, tracking, dt)
-        blended = transform(rotation, translation, registered + blend)
-        raw = jnp.where((blend != 0).any(-1, keepdims=True), blended, raw)
-
-    wrist = apart(wrist_pose(model, raw, rotation))
-    gone = jnp.where(state.visible, 0, state.drift + state.change[..., None])
-    drift = jnp.where(changed[..., None], gone, state.drift)
-    drift = drift + jnp.where(tracking, 0, DRIFT_UNSEEN * dt)[..., None]
+        correction, blend = _blend(model, frame, change, visible, dt)
+        moved = transform(frame.rotation, frame.translation, frame.registered + blend)
+        output = jnp.where((blend != 0).any(-1, keepdims=True), moved, output)
     return State(
         right=state.right,
         gate=state.gate,
         rejected=jnp.zeros_like(visible),
-        predictor=advance,
+        predictor=frame.predictor,
         smoothing=state.smoothing,
-        output=raw,
-        wrist_rotation=wrist[0],
-        wrist_position=wrist[1],
+        output=output,
+        wrist_rotation=state.wrist_rotation,
+        wrist_position=state.wrist_position,
         markers=markers,
         visible=visible,
-        tracked=state.tracked | tracking,
-        tracking=tracking,
-        rotation=rotation,
-        translation=translation,
-        seen=seen,
+        tracked=state.tracked | frame.tracking,
+        tracking=frame.tracking,
+        rotation=frame.rotation,
+        translation=frame.translation,
+        seen=jnp.where(visible[..., None], frame.registered, frame.seen),
         known=state.known | visible,
         correction=correction,
-        anchor=anchor,
-        prior=prior,
-        drift=jnp.where(visible, 0, drift),
+        anchor=frame.anchor,
+        prior=frame.prior,
+        drift=frame.drift,
         change=change,
     )
 
 
-def _register(
-    state: State,
-    template: Array,
-    markers: Array,
-    weight: Array,
-    changed: Array,
-    tracking: Array,
-    shift: Array,
-) -> tuple[Array, Array]:
-    """`world_from_template` of the visible markers; where they do not determine it, the previous
-    one moved along with them, and before there was one, the template at their mean."""
-    found_rotation, found_translation = kabsch(
-        template, markers, weight, lambda: _carried_prior(state, markers, weight, changed)
-    )
-    seen_any = (weight > 0).any(-1)[..., None]
-    centred = mean_point(markers, weight) - mean_point(template, weight)
-    start = jnp.where(seen_any, centred, state.translation)
+class _Frame(NamedTuple):
+    """A frame before the blend; what has the name of a field of `State` will be that."""
+
+    predictor: Any
+    tracking: Array
+    rotation: Array
+    translation: Array
+    seen: Array
+    """As carried from the frame before."""
+    correction: Array
+    anchor: Array
+    prior: Array
+    drift: Array
+    registered: Array
+    """`[..., M, 3]` registered frame: measured where visible, else predicted or held."""
+    raw: Array
+    """`[..., M, 3]` the same in the world."""
+
+
+def _frame(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> _Frame:
+    """Any frame. The one before is done again with this frame's visible set: a marker hidden then
+    takes its position of now, carried back by the hand's motion since."""
+    template = jnp.asarray(model.hand.template, markers.dtype)
+    weight, known = visible.astype(markers.dtype), visible[..., None]
+    tracking = second_extent(markers, weight) > DETERMINED_EXTENT
+    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
+    shift = mean_point(markers - state.markers, (visible & state.visible).astype(markers.dtype))
+
+    was_seen = state.visible[..., None]
+    before = transform(state.rotation, state.translation, state.seen)
+    before = apart(jnp.where(was_seen, state.markers, before))
+    turn, move = _motion(state, before, markers, visible, tracking, shift)
+    returned = jnp.where(was_seen, state.markers, untransform(turn, move, markers))
+    previous: Array = jnp.where(known, returned, 0)
+    # The prior is that of now, carried back too: if only the set has changed, so has nothing else.
+    followed = apart(product(turn.swapaxes(-1, -2), state.rotation))
+
+    def priors() -> Array:
+        carried = _carried_prior(state, markers, weight)
+        return jnp.stack([jnp.where(changed[..., None, None], state.rotation, carried), followed])
+
+    # Both frames at once, from here to the network.
+    both = apart(jnp.stack([markers, previous]))
+    rotations, translations = kabsch(template, both, weight, priors)
+    sure, tracked = tracking[..., None, None], state.tracked[..., None, None]
+    start = mean_point(markers, weight) - mean_point(template, weight)
+    start = jnp.where(visible.any(-1, keepdims=True), start, state.translation)
     moved = jnp.where(state.tracked[..., None], state.translation + shift, start)
-    rotation = jnp.where(tracking[..., None, None], found_rotation, state.rotation)
-    return rotation, jnp.where(tracking[..., None], found_translation, moved)
+    moved = jnp.stack([moved, state.translation])
+    rotations = jnp.where(sure, rotations, state.rotation)
+    translations = jnp.where(tracking[..., None], translations, moved)
+    rotations, translations = apart((rotations, translations))
+    now, then = ((rotations[i], translations[i]) for i in (0, 1))
+    # Before there was any output the template stands in for it.
+    placed = transform(*now, template)
+    last = jnp.where(tracked, state.output, placed)
+    held = jnp.where(tracked, last + shift[..., None, :], placed)
+
+    measured = apart(untransform(rotations, translations, both))
+    if PREDICTORS[model.predictor].of_frame is not None:
+        advance, filled, raw = _fill(
+            model, state.predictor, measured, markers, visible, last, dt, now, now
+        )
+        registered, again = filled
+    else:
+        earlier = _registration_before(state, then, changed, now)
+        advance, registered, raw = _fill(
+            model, state.predictor, measured[0], markers, visible, last, dt, now, earlier
+        )
+        still = jnp.zeros_like(dt)
+        _, again, _ = _fill(
+            model, state.predictor, measured[1], previous, visible, last, still, then, then
+        )
+    registered = apart(jnp.where(sure | known, registered, untransform(*now, held)))
+    raw = jnp.where(sure | known, raw, held)
+    correction = jnp.where(sure | known, untransform(*then, last) - again, 0)
+
+    length = jnp.sqrt((correction * correction).sum(-1, keepdims=True))
+    correction = jnp.where(length < FARTHEST_CORRECTION, correction, 0)
+    seen = untransform(*now, transform(turn, move, before))
+    drift = jnp.where(state.visible, 0, state.drift + state.change[..., None])
+    # Hands whose set is the same go on as they were; those seen for the first time begin.
+    restart, begin = (changed & state.tracked)[..., None, None], ~tracked
+    correction = jnp.where(begin, 0, jnp.where(restart, correction, state.correction))
+    anchor = jnp.where(begin, registered, jnp.where(restart, measured[1], state.anchor))
+    seen = jnp.where(restart & sure, seen, jnp.where(begin & ~known, template, state.seen))
+    at_first = product(now[0].swapaxes(-1, -2), state.rotation)
+    prior = product(then[0].swapaxes(-1, -2), followed)
+    prior = jnp.where(restart, prior, jnp.where(begin, at_first, state.prior))
+    drift = jnp.where(changed[..., None], drift, state.drift)
+    drift = drift + jnp.where(tracking, 0, DRIFT_UNSEEN * dt)[..., None]
+    correction, anchor = apart((correction, anchor))
+    return _Frame(
+        advance,
+        tracking,
+        *now,
+        seen,
+        correction,
+        anchor,
+        prior,
+        jnp.where(visible, 0, drift),
+        registered,
+        raw,
+    )
 
 
-def _carried_prior(state: State, markers: Array, weight: Array, changed: Array) -> Array:
+def _carried_prior(state: State, markers: Array, weight: Array) -> Array:
     """`[..., 3, 3]` world_from_template that the registration follows where the template's visible
-    markers are near a line. The previous rotation would not do while the set stays the same: each
+    markers are near a line, while the set stays the same. The previous rotation would not do: each
     frame would give it up a little more, and a hand that stands still would turn."""
-    turn, _ = kabsch(state.anchor, markers, weight, state.rotation)
-    return jnp.where(changed[..., None, None], state.rotation, product(turn, state.prior))
+    return product(kabsch(state.anchor, markers, weight, state.rotation)[0], state.prior)
 
 
 def _fill(
     model: Model,
     predictor: Any,
+    registered: Array,
     markers: Array,
     visible: Array,
     last: Array,
     dt: Array,
     registration: tuple[Array, Array],
     before: tuple[Array, Array],
-) -> tuple[Any, Array]:
+) -> tuple[Any, Array, Array]:
     """One step of the model's predictor; one that looks at this frame alone is spared a second
-    registration.
+    registration, and asked of `registered` frames of which the first is this.
 
     What a predictor that goes by the frame has nothing to say of moves with the hand: from the
     registration `before`, of the previous frame by the same markers, to that of this frame.
+
+    Returns:
+        The predictor's next state, and `registered` and `raw` as in `_Frame`.
     """
     chosen = PREDICTORS[model.predictor]
     if chosen.of_frame is not None:
-        said = chosen.of_frame(model, untransform(*registration, markers), visible)
-        moved = transform(*registration, said)
-        return predictor, jnp.where(visible[..., None], markers, moved)
+        said = apart(chosen.of_frame(model, registered, visible))
+        registered = jnp.where(visible[..., None], registered, said)
+        moved = transform(*registration, registered[0])
+        return predictor, registered, jnp.where(visible[..., None], markers, moved)
     if chosen.uses_frame:
         last = transform(*registration, untransform(*before, last))
-    return chosen.step(model, predictor, markers, visible, last, dt)
+    advance, raw = chosen.step(model, predictor, markers, visible, last, dt)
+    return advance, untransform(*registration, raw), raw
 
 
 def _registration_before(
-    state: State, redone: _Redone, changed: Array, rotation: Array, translation: Array
+    state: State, then: tuple[Array, Array], changed: Array, now: tuple[Array, Array]
 ) -> tuple[Array, Array]:
     """The previous frame's registration by the markers visible now; this frame's own for a hand
     that had not been tracked."""
-    parts = (
-        (redone.rotation, state.rotation, rotation),
-        (redone.translation, state.translation, translation),
-    )
-    return tuple(
-        choose(state.tracked, choose(changed, again, earlier), now) for again, earlier, now in parts
-    )
-
-
-class _Redone(NamedTuple):
-    """The previous frame, done with this frame's visible set."""
-
-    rotation: Array
-    """`[..., 3, 3]` world_from_template."""
-    translation: Array
-    """`[..., 3]` its translation."""
-    correction: Array
-    anchor: Array
-    seen: Array
-    prior: Array
-    """What `State` keeps under these names, but that `seen` is in this frame's registration."""
-
-
-def _redo(
-    model: Model,
-    state: State,
-    markers: Array,
-    visible: Array,
-    tracking: Array,
-    shift: Array,
-    last: Array,
-    rotation: Array,
-    translation: Array,
-) -> _Redone:
-    """The previous frame, done with this frame's visible set.
-
-    A marker hidden then takes its position of now, carried back by the hand's motion since.
-    """
-    dtype = markers.dtype
-    template = jnp.asarray(model.hand.template, dtype)
-    before = transform(state.rotation, state.translation, state.seen)
-    before = jnp.where(state.visible[..., None], state.markers, before)
-    turn, move = apart(_motion(state, before, markers, visible, tracking, shift))
-    returned = untransform(turn, move, markers)
-    returned = jnp.where(state.visible[..., None], state.markers, returned)
-    previous: Array = apart(jnp.where(visible[..., None], returned, 0))
-    # The prior is that of now, carried back too: if only the set has changed, so has nothing else.
-    prior = product(jnp.swapaxes(turn, -1, -2), state.rotation)
-    found = kabsch(template, previous, visible.astype(dtype), prior)
-    then_rotation = jnp.where(tracking[..., None, None], found[0], state.rotation)
-    then_translation = jnp.where(tracking[..., None], found[1], state.translation)
-    then = (then_rotation, then_translation)
-    _, filled = _fill(
-        model, state.predictor, previous, visible, last, jnp.zeros_like(shift[..., 0]), then, then
-    )
-    raw = jnp.where((tracking[..., None] | visible)[..., None], filled, last)
-    correction = untransform(*then, last) - untransform(*then, raw)
-    length = jnp.sqrt((correction * correction).sum(-1, keepdims=True))
-    correction = jnp.where(length < FARTHEST_CORRECTION, correction, 0)
-    seen = untransform(rotation, translation, transform(turn, move, before))
-    followed = product(then_rotation.swapaxes(-1, -2), prior)
-    return _Redone(*then, correction, untransform(*then, previous), seen, followed)
+    earlier = state.rotation, state.translation
+    return choose(state.tracked, choose(changed, then, earlier), now)
 
 
 def _motion(
@@ -266,46 +257,44 @@ def _motion(
     """
     dtype = markers.dtype
     both = (visible & state.visible).astype(dtype)
-    eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), state.rotation.shape)
-    earlier = (visible & state.known).astype(dtype)
-    turn, move = kabsch(before, markers, earlier, eye)
-    misfit = mean_point((transform(turn, move, before) - markers) ** 2, earlier).sum(-1)
-    believed = tracking & (~state.tracking | (misfit < SAME_POSTURE**2)) & (earlier > 0).any(-1)
-    turn = jnp.where(believed[..., None, None], turn, eye)
-    move = jnp.where(believed[..., None], move, shift)
-    seen_turn, seen_move = kabsch(before, markers, both, turn)
+
+    def believed() -> tuple[Array, Array]:
+        eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), state.rotation.shape)
+        earlier = (visible & state.known).astype(dtype)
+        turn, move = kabsch(before, markers, earlier, eye)
+        misfit = mean_point((transform(turn, move, before) - markers) ** 2, earlier).sum(-1)
+        still = ~state.tracking | (misfit < SAME_POSTURE**2)
+        believe = tracking & still & (earlier > 0).any(-1)
+        turn = jnp.where(believe[..., None, None], turn, eye)
+        return turn, jnp.where(believe[..., None], move, shift)
+
     decide = tracking & (both > 0).any(-1)
-    return (
-        jnp.where(decide[..., None, None], seen_turn, turn),
-        jnp.where(decide[..., None], seen_move, move),
-    )
+    turn, move = apart(kabsch(before, markers, both, lambda: believed()[0]))
+    other = jax.lax.cond(decide.all(), lambda: (turn, move), believed)
+    return choose(decide, (turn, move), other)
 
 
-def _change(anchor: Array, registered: Array, visible: Array) -> Array:
+def _change(frame: _Frame, visible: Array) -> Array:
     """`[...]` metres, RMS: how far the visible markers have gone in the registered frame since the
     corrections were set; 0 where none is hidden."""
-    difference = jnp.where(visible[..., None], registered - anchor, 0)
-    seen = jnp.maximum(visible.sum(-1), 1).astype(registered.dtype)
+    difference = jnp.where(visible[..., None], frame.registered - frame.anchor, 0)
+    seen = jnp.maximum(visible.sum(-1), 1).astype(difference.dtype)
     distance = jnp.sqrt((difference * difference).sum((-1, -2)) / seen)
     return jnp.where(visible.all(-1), 0, distance)
 
 
 def _blend(
-    model: Model,
-    correction: Array,
-    change: Array,
-    visible: Array,
-    tracking: Array,
-    dt: Array,
+    model: Model, frame: _Frame, change: Array, visible: Array, dt: Array
 ) -> tuple[Array, Array]:
     """The corrections to keep, and those to add now; `[..., M, 3]`, registered frame."""
+    correction = frame.correction
     length = jnp.sqrt((correction * correction).sum(-1))
     left = jnp.maximum(length - SHRINK_SPEED * dt[..., None], 0)
     share = jnp.where(visible & (length > 0), left / jnp.where(length > 0, length, 1), 1)
     correction = correction * share[..., None]
-    fade = jnp.where(tracking, jnp.exp(-change / model.fade), 0)
-    blend = jnp.where(visible[..., None], correction, correction * fade[..., None, None])
-    return correction, blend
+    fade = jnp.where(frame.tracking, jnp.exp(-change / model.fade), 0)
+    faded = correction * fade[..., None, None]
+    return correction, jnp.where(visible[..., None], correction, faded)
 
 
 def choose(condition: Array, yes: Any, no: Any) -> Any:

@@ -16,12 +16,12 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxhand import sequences as data
 from jaxhand import tracker
+from jaxhand.compiled import compiled
 from jaxhand.predictors import PREDICTORS
 from numpy_infer.arrays import Array
 from numpy_infer.model import Model
@@ -279,7 +279,7 @@ def padded(values: Array, size: int) -> Array:
     return values[np.minimum(np.arange(size), len(values) - 1)]
 
 
-@jax.jit
+@compiled
 def _step(
     model: Model, state: Any, markers: Array, visible: Array, dt: Array
 ) -> tuple[Any, HandPose]:

@@ -23,7 +23,8 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from jaxhand.geometry import apart, kabsch, mean_point, second_extent, transform
+from jaxhand.compiled import apart
+from jaxhand.geometry import kabsch, mean_point, second_extent, transform
 from numpy_infer.arrays import Array
 from numpy_infer.gate import (
     BRIEFEST,

@@ -5,13 +5,15 @@ Points are rows, rotations act on columns: `world = hand @ rotation.T + translat
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
-from typing import Any
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxhand.compiled import apart
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import PRIOR_STRENGTH
 
@@ -19,20 +21,16 @@ _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
 def product(a: Array, b: Array) -> Array:
-    """Matrix product of small matrices as multiply and sum: XLA fuses it, where batched `dot` is a
-    call for each matrix, and it stays float32 on devices whose `dot` would round to less."""
-    return (a[..., :, :, None] * b[..., None, :, :]).sum(-2)
+    """Matrix product of small matrices, term by term: XLA fuses that into one loop over the batch.
+    Batched `dot` is a call for each matrix, and a sum over a short axis a loop for each entry; and
+    it stays float32 on devices whose `dot` would round to less."""
+    terms = (a[..., :, k, None] * b[..., None, k, :] for k in range(a.shape[-1]))
+    return reduce(operator.add, terms)
 
 
 def inner(a: Array, b: Array) -> Array:
-    """`[..., N, i]`, `[..., N, j]` → `[..., i, j]`: sums over the points."""
-    return jnp.einsum("...ni,...nj->...ij", a, b, precision="highest")
-
-
-def apart(values: Any) -> Any:
-    """The same values, computed once. XLA's fusion on the CPU would otherwise compute what leads to
-    a small matrix again for each use of each of its entries, ten to fifty times over."""
-    return jax.lax.optimization_barrier(values)
+    """`[..., N, i]`, `[..., N, j]` → `[..., i, j]`: sums over the points, as `product` has them."""
+    return product(a.swapaxes(-1, -2), b)
 
 
 def mirror(points: Array) -> Array:
@@ -133,8 +131,11 @@ def kabsch(
     source_mean, target_mean = apart((mean_point(source, weight), mean_point(target, weight)))
     centred = (target - target_mean[..., None, :]) * weight[..., None]
     covariance = apart(inner(centred, source - source_mean[..., None, :]))
-    prior = prior() if callable(prior) else prior
-    weighed = apart(covariance + prior_weight(covariance)[..., None, None] * prior)
+    strength = prior_weight(covariance)[..., None, None]
+    if callable(prior):
+        eye = jnp.broadcast_to(jnp.eye(3, dtype=covariance.dtype), covariance.shape)
+        prior = jax.lax.cond((strength > 0).any(), prior, lambda: eye)
+    weighed = apart(covariance + strength * prior)
     rotation = apart(nearest_rotation(weighed))
     moved = product(rotation, source_mean[..., None])[..., 0]
     return apart((rotation, target_mean - moved))
@@ -155,8 +156,7 @@ def nearest_rotation(matrix: Array) -> Array:
 
     Not by SVD, which is a LAPACK call for each matrix. Horn's (1987) symmetric 4×4 matrix, whose
     leading eigenvector is the quaternion of R, is shifted to be positive and squared until that
-    eigenvector alone is left.
-    All of it on scalars side by side, because XLA runs those as one loop over the batch.
+    eigenvector alone is left. Its axes stand before the batch's, so that XLA runs along the batch.
     """
     size = jnp.sqrt((matrix * matrix).sum((-1, -2), keepdims=True))
     unit = matrix / jnp.where(size > 0, size, 1)
@@ -165,32 +165,24 @@ def nearest_rotation(matrix: Array) -> Array:
     )
     # |unit| = 1, so the eigenvalues lie within ±√3 and a shift of 1.75 makes all of them positive.
     horn = (
-        *(xx - yy - zz + 1.75, xy + yx, xz + zx, zy - yz),
-        *(yy - xx - zz + 1.75, yz + zy, xz - zx),
-        *(zz - xx - yy + 1.75, yx - xy),
-        xx + yy + zz + 1.75,
+        (xx - yy - zz + 1.75, xy + yx, xz + zx, zy - yz),
+        (xy + yx, yy - xx - zz + 1.75, yz + zy, xz - zx),
+        (xz + zx, yz + zy, zz - xx - yy + 1.75, yx - xy),
+        (zy - yz, xz - zx, yx - xy, xx + yy + zz + 1.75),
     )
-    xx, xy, xz, xw, yy, yz, yw, zz, zw, ww = jax.lax.fori_loop(0, 24, _squared, horn)
-    columns = ((xx, xy, xz, xw), (xy, yy, yz, yw), (xz, yz, zz, zw), (xw, yw, zw, ww))
+    projector = apart(jnp.stack([jnp.stack(row) for row in horn]))
+    projector = jax.lax.fori_loop(0, 6, _to_the_sixteenth, projector)
     # Every column of the projector is the eigenvector; take the longest.
-    pivot = jnp.argmax(jnp.stack([xx, yy, zz, ww], -1), -1)
-    q = tuple(jnp.select([pivot == i for i in range(4)], list(column)) for column in columns)
+    pivot = jnp.argmax(jnp.stack([projector[i, i] for i in range(4)]), 0)
+    q = tuple(jnp.select([pivot == i for i in range(4)], list(column)) for column in projector)
     return jnp.stack([jnp.stack(row, -1) for row in _rotation(_normalised(q))], -2)
 
 
-def _squared(_: int, upper: tuple[Array, ...]) -> tuple[Array, ...]:
-    """The square, scaled to trace 1, of a symmetric 4×4 matrix given by its 10 upper entries."""
-    a, b, c, d, e, f, g, h, i, j = upper
-    square = (
-        *(a * a + b * b + c * c + d * d, a * b + b * e + c * f + d * g),
-        *(a * c + b * f + c * h + d * i, a * d + b * g + c * i + d * j),
-        *(b * b + e * e + f * f + g * g, b * c + e * f + f * h + g * i),
-        b * d + e * g + f * i + g * j,
-        *(c * c + f * f + h * h + i * i, c * d + f * g + h * i + i * j),
-        d * d + g * g + i * i + j * j,
-    )
-    scale = 1 / (square[0] + square[4] + square[7] + square[9])
-    return tuple(entry * scale for entry in square)
+def _to_the_sixteenth(_: int, matrix: Array) -> Array:
+    """The 16th power, scaled to trace 1, of symmetric matrices `[4, 4, ...]`."""
+    for _ in range(4):
+        matrix = apart(reduce(operator.add, (matrix[:, k, None] * matrix[k] for k in range(4))))
+    return matrix / apart(matrix[0, 0] + matrix[1, 1] + matrix[2, 2] + matrix[3, 3])
 
 
 def _normalised(q: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxhand import evaluation, ik, sparse_fit, tracker
 from jaxhand import sequences as data
+from jaxhand.compiled import compiled
 from jaxhand.evaluation import Cell, Report, Starts, interval
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from jaxhand.sparse_fit import PosePrior
@@ -258,7 +259,7 @@ def evaluate_poses(model: Model, markers: Array) -> HandPose:
     return HandPose(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-@jax.jit
+@compiled
 def _pose(model: Model, markers: Array, visible: Array, dt: Array) -> HandPose:
     state = tracker.init(model, (len(markers),))
     return tracker.step(model, state, markers, visible, dt)[1]

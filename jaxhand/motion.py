@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxhand.anthropometry import People, mean_person
+from jaxhand.compiled import apart
 from jaxhand.contact import FINGER_OF_ANGLE, HIGH, LOW, OF_FINGER, depth, first_clear, settled
-from jaxhand.geometry import apart
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, FINGERS, load_hand
 

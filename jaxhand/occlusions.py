@@ -20,6 +20,7 @@ from rich.table import Table
 
 from jaxhand.anthropometry import people
 from jaxhand.cameras import Rig, film
+from jaxhand.compiled import compiled
 from jaxhand.two_hands import two_hands
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand, bundled, load_hand
@@ -335,7 +336,7 @@ def _simulated(config: OcclusionsConfig) -> dict[str, Occlusions]:
     if min(frames, rig.cameras) < 1:
         raise ValueError("seconds, cameras: expected at least one frame and one camera")
 
-    @jax.jit
+    @compiled
     def seen(key: Array) -> tuple[Array, Array]:
         person_key, motion_key, key = jax.random.split(key, 3)
         person = people(person_key, hand, (RECORDINGS,))

@@ -19,7 +19,8 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from jaxhand.geometry import apart, centre, inner, kabsch, product, solve, transform, untransform
+from jaxhand.compiled import apart
+from jaxhand.geometry import centre, inner, kabsch, product, solve, transform, untransform
 from jaxhand.networks import predict
 from numpy_infer.arrays import Array
 from numpy_infer.model import Model

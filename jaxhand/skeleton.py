@@ -5,7 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhand.geometry import apart, product, shortest_arc, transform
+from jaxhand.compiled import apart
+from jaxhand.geometry import product, shortest_arc, transform
 from numpy_infer.arrays import Array
 from numpy_infer.hand import CHAINS, JOINTS, Hand
 from numpy_infer.skeleton import (
@@ -52,12 +53,16 @@ def angles_from_rotations(rotations: Array) -> Array:
 
 
 def _euler(rotations: Array, axes: Array) -> Array:
-    """`[..., 3]` radians about x, y and z of `axes`, in that order, of `[..., 3, 3]`."""
+    """`[..., 3]` radians about x, y and z of `axes`, in that order, of `[..., 3, 3]`. The latter
+    two of what the first leaves (Day 2012): near ±90° about y, where the first is hardly known,
+    they make up for it."""
     axes = jnp.asarray(axes).astype(rotations.dtype)
     m = product(product(jnp.swapaxes(axes, -1, -2), rotations), axes)
     about_x = jnp.arctan2(-m[..., 1, 2], m[..., 2, 2])
-    about_y = jnp.arctan2(m[..., 0, 2], jnp.sqrt(m[..., 0, 0] ** 2 + m[..., 0, 1] ** 2))
-    about_z = jnp.arctan2(-m[..., 0, 1], m[..., 0, 0])
+    cosine, sine = jnp.cos(about_x), jnp.sin(about_x)
+    left = cosine[..., None] * m[..., 1, :2] + sine[..., None] * m[..., 2, :2]
+    about_y = jnp.arctan2(m[..., 0, 2], cosine * m[..., 2, 2] - sine * m[..., 1, 2])
+    about_z = jnp.arctan2(left[..., 0], left[..., 1])
     return jnp.stack([about_x, about_y, about_z], -1)
 
 
@@ -188,9 +193,8 @@ def place_fingers(
     ends, has = hand.end_markers
     base = jnp.asarray(hand.skeleton, dtype)[1:16:3]
     waves = _waves(angles[..., FINGER_ANGLES])
-    products = _products(*(waves[..., i, :] for i in range(3)))
-    turn = _form(products[..., 0, :], BASE_FORM).reshape(*batch, 5, 3, 3)
-    own = _form(products[..., 1, :], finger_forms(hand, jnp).beyond).reshape(*batch, 5, 3, 10)
+    turn = _form(waves[..., 0, :, :], BASE_FORM).reshape(*batch, 5, 3, 3)
+    own = _form(waves[..., 1, :, :], finger_forms(hand, jnp).beyond).reshape(*batch, 5, 3, 10)
     if markers is not None:
         modelled = product(turn, own[..., 9:])[..., 0]
         measured = jnp.where(has[:, None] > 0, markers[..., ends, :] - base, modelled)
@@ -213,15 +217,14 @@ def _waves(angles: Array) -> Array:
     return jnp.stack([jnp.ones_like(angles), jnp.cos(angles), jnp.sin(angles)], -1)
 
 
-def _products(first: Array, second: Array, third: Array) -> Array:
-    """`[..., 27]` products of three `[..., 3]`, the last one's running fastest."""
-    three = first[..., :, None, None] * second[..., None, :, None] * third[..., None, None, :]
-    return three.reshape(*three.shape[:-3], 27)
-
-
-def _form(products: Array, form: Array) -> Array:
-    """`[..., 5, K]` products by each finger's `[5, K, out]` form."""
-    return jnp.einsum("...fp,fpo->...fo", products, jnp.asarray(form, products.dtype))
+def _form(waves: Array, form: Array) -> Array:
+    """`[..., 5, K]` by each finger's `form [5, 27, K]`: linear in products of the 1, cosine and
+    sine of its three angles, `waves [..., 5, 3, 3]`, the last one's running fastest."""
+    table = jnp.asarray(form, waves.dtype).reshape(5, 3, 3, 3, -1)
+    of_each = (waves[..., i, :] for i in range(3))
+    return jnp.einsum(
+        "...fi,...fj,...fk,fijko->...fo", *of_each, table, precision="highest", optimize="optimal"
+    )
 
 
 def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
@@ -245,15 +248,11 @@ def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
     value = _waves(angles[..., OUTER_ANGLES])
     zero = jnp.zeros_like(value[..., 0])
     slope = jnp.stack([zero, -value[..., 2], value[..., 1]], -1)
-    square = finger_forms(hand, jnp).square.reshape(5, 27, 1)
-
-    def of(first: Array, last: Array) -> Array:
-        products = _products(first[..., 0, :], value[..., 1, :], last[..., 2, :])
-        return _form(products, square)[..., 0]
-
-    reach = jnp.sqrt(jnp.maximum(of(value, value), 0))
-    slopes = jnp.stack([of(slope, value), of(value, slope)], -1)
-    slopes = slopes / (2 * jnp.where(reach > 0, reach, 1))[..., None]
+    by_first, by_last = (value.at[..., i, :].set(slope[..., i, :]) for i in (0, 2))
+    form = finger_forms(hand, jnp).square
+    square, *sloping = (_form(waves, form)[..., 0] for waves in (value, by_first, by_last))
+    reach = jnp.sqrt(jnp.maximum(square, 0))
+    slopes = jnp.stack(sloping, -1) / (2 * jnp.where(reach > 0, reach, 1))[..., None]
     target = markers[..., ends, :] - jnp.asarray(hand.skeleton, dtype)[1:16:3]
     short = has.astype(dtype) * (jnp.sqrt((target * target).sum(-1)) - reach)
     damped = (slopes * slopes).sum(-1) + (BEND_NOISE / BEND_PRIOR) ** 2

@@ -13,10 +13,11 @@ import jax.numpy as jnp
 from jaxhand import gate, one_euro
 from jaxhand.continuity import advance
 from jaxhand.geometry import mirror
-from jaxhand.output import hand_pose, smoothed
+from jaxhand.output import hand_pose, smoothed, wrist_pose
 from jaxhand.predictors import PREDICTORS
 from numpy_infer.arrays import Array
 from numpy_infer.model import ERROR_CHANGES, Model
+from numpy_infer.one_euro import Filter, Smoothing
 from numpy_infer.pose import HandPose, State
 from numpy_infer.tracker import FARTHEST, LONGEST, SHOWN
 
@@ -83,7 +84,7 @@ def step(
             time moves, and the same markers again change nothing.
     """
     markers, visible, elapsed, late = _cleaned(state, markers, visible, dt)
-    state = shown = advance(model, state, markers, visible, elapsed, late)
+    state = shown = _posed(model, advance(model, state, markers, visible, elapsed, late))
     if model.smoothing is not None:
         state, shown = smoothed(model, model.smoothing, state, elapsed)
     return state, hand_pose(model, shown, late)
@@ -107,15 +108,40 @@ def run(
     markers, visible, elapsed, late = _cleaned(state, markers, visible, dt)
 
     def frame(state: State, of: tuple[Array, ...]) -> tuple[State, dict[str, Array]]:
-        state = shown = advance(model, state, *of)
-        if model.smoothing is not None:
-            state, shown = smoothed(model, model.smoothing, state, of[2])
-        return state, {name: getattr(shown, name) for name in SHOWN}
+        state = advance(model, state, *of)
+        return state, {name: getattr(state, name) for name in (*SHOWN, "rotation")}
 
-    # Joints depend on their own frame alone: they are made of all frames at once.
+    # The wrist and the joints depend on their own frame alone: they are made of all at once.
     state, shown = jax.lax.scan(frame, state, (markers, visible, elapsed, late))
     right = jnp.broadcast_to(state.right, late.shape)
-    return state, hand_pose(model, state._replace(right=right, **shown), late)
+    every = _posed(model, state._replace(right=right, **shown))
+    wrist = every.wrist_rotation[-1], every.wrist_position[-1]
+    state = state._replace(wrist_rotation=wrist[0], wrist_position=wrist[1])
+    if model.smoothing is not None:
+        own, every = _smoothed(model, model.smoothing, state, every, elapsed)
+        state = state._replace(smoothing=own)
+    return state, hand_pose(model, every, late)
+
+
+def _posed(model: Model, state: State) -> State:
+    """The state with the wrist's pose of its output."""
+    rotation, position = wrist_pose(model, state.output, state.rotation)
+    return state._replace(wrist_rotation=rotation, wrist_position=position)
+
+
+def _smoothed(
+    model: Model, smoothing: Smoothing, state: State, every: State, dt: Array
+) -> tuple[Filter, State]:
+    """The output filter's state after many frames, and `every` state with what is to be shown."""
+
+    def frame(own: Filter, of: tuple[Array, ...]) -> tuple[Filter, Array]:
+        tracked, markers, elapsed = of
+        own = own._replace(begun=own.begun & tracked)
+        return one_euro.step(smoothing, own, markers, elapsed)
+
+    own, output = jax.lax.scan(frame, state.smoothing, (every.tracked, every.output, dt))
+    rotation, position = wrist_pose(model, output, every.wrist_rotation)
+    return own, every._replace(output=output, wrist_rotation=rotation, wrist_position=position)
 
 
 def _cleaned(

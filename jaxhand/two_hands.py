@@ -19,7 +19,8 @@ import numpy as np
 
 from jaxhand import contact, motion
 from jaxhand.anthropometry import People, mean_person
-from jaxhand.geometry import apart, mirror, mirror_rotation, product
+from jaxhand.compiled import apart
+from jaxhand.geometry import mirror, mirror_rotation, product
 from jaxhand.motion import KEYFRAMES, Motion
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand, load_hand

@@ -107,13 +107,17 @@ def angles_from_rotations(rotations: Array) -> Array:
 
 
 def _euler(rotations: Array, axes: Array) -> Array:
-    """`[..., 3]` radians about x, y and z of `axes`, in that order, of `[..., 3, 3]`."""
+    """`[..., 3]` radians about x, y and z of `axes`, in that order, of `[..., 3, 3]`. The latter
+    two of what the first leaves (Day 2012): near ±90° about y, where the first is hardly known,
+    they make up for it."""
     axes = axes.astype(rotations.dtype, copy=False)
     m = axes.swapaxes(-1, -2) @ rotations @ axes
     euler = np.empty(m.shape[:-1], rotations.dtype)
-    euler[..., 0] = np.arctan2(-m[..., 1, 2], m[..., 2, 2])
-    euler[..., 1] = np.arctan2(m[..., 0, 2], np.sqrt(m[..., 0, 0] ** 2 + m[..., 0, 1] ** 2))
-    euler[..., 2] = np.arctan2(-m[..., 0, 1], m[..., 0, 0])
+    euler[..., 0] = about_x = np.arctan2(-m[..., 1, 2], m[..., 2, 2])
+    cosine, sine = np.cos(about_x), np.sin(about_x)
+    left = cosine[..., None] * m[..., 1, :2] + sine[..., None] * m[..., 2, :2]
+    euler[..., 1] = np.arctan2(m[..., 0, 2], cosine * m[..., 2, 2] - sine * m[..., 1, 2])
+    euler[..., 2] = np.arctan2(left[..., 0], left[..., 1])
     return euler
 
 
