@@ -65,34 +65,17 @@ def advance(
     frame = _steady(model, state, markers, accepted, weight, dt)
     if frame is None:
         frame = _unsteady(model, state, markers, accepted, weight, dt)
-    new_state = _blended(model, state, frame, markers, accepted, weight, dt, own, rejected)
+    new_state = blended(model, state, frame, markers, accepted, weight, dt, own, rejected)
     if np.count_nonzero(late):
         same = (accepted == state.visible).all(-1) & (markers == state.markers).all((-1, -2))
         new_state = choose(late & state.known.any(-1) & same, state, new_state)
     return new_state
 
 
-def together(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State | None:
-    """The states, an axis in front or 1 in its place, after each of several frames of one visible
-    set `[T, ..., M]`, which the caller sees to; None if they are not all steady, or not quiet for
-    the gate. While the set stays, a correction depends on the time since, not on the frames
-    between."""
-    if np.count_nonzero(state.tracking) < state.tracking.size:
-        return None
-    own = gate.quietly(state.gate, markers, visible, dt) if model.gate else state.gate
-    if own is None:
-        return None
-    state, own = (each(lambda leaf: leaf[None], tree) for tree in (state, own))
-    visible, elapsed = visible[:1], np.cumsum(dt, 0)
-    weight, rejected = visible.astype(markers.dtype), np.zeros_like(visible)
-    frame = _steady(model, state, markers, visible, weight, elapsed)
-    return frame and _blended(model, state, frame, markers, visible, weight, elapsed, own, rejected)
-
-
-def _blended(
+def blended(
     model: Model,
     state: State,
-    frame: _Frame,
+    frame: Frame,
     markers: Array,
     visible: Array,
     weight: Array,
@@ -102,11 +85,11 @@ def _blended(
 ) -> State:
     """The state after a frame: output and wrist, with corrections added. `own` is the gate's."""
     correction, placed, exact = frame.correction, frame.registered, frame.exact
-    change = _change(frame, visible, weight)
+    change = posture_change(frame, visible, weight)
     if model.continuity and np.count_nonzero(correction):
-        correction, blend = _blend(model, frame, change, visible, weight, dt)
-        placed = placed + blend
-        exact = exact & (blend == 0).all(-1)
+        correction, added = blend(model, correction, frame.tracking, change, visible, weight, dt)
+        placed = placed + added
+        exact = exact & (added == 0).all(-1)
     output = frame.raw
     if not exact.all():
         moved = transform(frame.rotation, frame.translation, placed)
@@ -137,7 +120,7 @@ def _blended(
     )
 
 
-class _Frame(NamedTuple):
+class Frame(NamedTuple):
     """A frame before the blend; what has the name of a field of `State` will be that."""
 
     predictor: Any
@@ -161,7 +144,7 @@ class _Frame(NamedTuple):
 
 def _steady(
     model: Model, state: State, markers: Array, visible: Array, weight: Array, dt: Array
-) -> _Frame | None:
+) -> Frame | None:
     """The frame if every hand is tracked and sees the markers of the frame before, as in most
     frames; else None."""
     hand, tracking = model.hand, state.tracking
@@ -186,7 +169,7 @@ def _steady(
     )
     if direct and np.count_nonzero(state.correction):
         direct = not np.count_nonzero(state.correction[..., hand.aligned, :])
-    advance, registered, raw, exact = _fill(
+    advance, registered, raw, exact = fill(
         model,
         state.predictor,
         registered,
@@ -197,7 +180,7 @@ def _steady(
         registration,
         before,
     )
-    return _Frame(
+    return Frame(
         advance,
         tracking,
         *registration,
@@ -226,7 +209,7 @@ def _patterns(hand: Hand, body: Hand, dtype: str, shape: tuple[int, ...], seen: 
 
 def _unsteady(
     model: Model, state: State, markers: Array, visible: Array, weight: Array, dt: Array
-) -> _Frame:
+) -> Frame:
     """Any frame. The one before is done again with this frame's visible set: a marker hidden then
     takes its position of now, carried back by the hand's motion since."""
     template = model.hand.template.astype(markers.dtype, copy=False)
@@ -271,17 +254,17 @@ def _unsteady(
     measured = untransform(rotations, translations, np.stack([markers, previous]))
     if PREDICTORS[model.predictor].of_frame is not None:
         # Both frames in one product per layer of the network.
-        advance, both, raw, exact = _fill(
+        advance, both, raw, exact = fill(
             model, state.predictor, measured, markers, visible, last, dt, now, now
         )
         registered, again = both
     else:
         earlier = _registration_before(state, then, changed, now)
-        advance, registered, raw, exact = _fill(
+        advance, registered, raw, exact = fill(
             model, state.predictor, measured[0], markers, visible, last, dt, now, earlier
         )
         still = np.zeros_like(dt)
-        _, again, *_ = _fill(
+        _, again, *_ = fill(
             model, state.predictor, measured[1], previous, visible, last, still, then, then
         )
     correction = untransform(*then, last) - again
@@ -306,7 +289,7 @@ def _unsteady(
         drift = np.where(changed[..., None], drift, state.drift)
     drift = drift + np.where(tracking, 0, DRIFT_UNSEEN * dt)[..., None]
     drift = np.where(visible, 0, drift).astype(markers.dtype, copy=False)
-    return _Frame(
+    return Frame(
         advance,
         tracking,
         *now,
@@ -329,7 +312,7 @@ def _carried_prior(state: State, markers: Array, weight: Array) -> Array:
     return kabsch(state.anchor, markers, weight, state.rotation)[0] @ state.prior
 
 
-def _fill(
+def fill(
     model: Model,
     predictor: Any,
     registered: Array,
@@ -347,7 +330,7 @@ def _fill(
     registration `before`, of the previous frame by the same markers, to that of this frame.
 
     Returns:
-        The predictor's next state, and `registered`, `raw` and `exact` as in `_Frame`.
+        The predictor's next state, and `registered`, `raw` and `exact` as in `Frame`.
     """
     chosen = PREDICTORS[model.predictor]
     if chosen.of_frame is not None:
@@ -403,7 +386,7 @@ def _motion(
     )
 
 
-def _change(frame: _Frame, visible: Array, weight: Array) -> Array:
+def posture_change(frame: Frame, visible: Array, weight: Array) -> Array:
     """`[...]` metres, RMS: how far the visible markers have gone in the registered frame since the
     corrections were set; 0 where none is hidden."""
     everything = visible.all(-1)
@@ -414,18 +397,23 @@ def _change(frame: _Frame, visible: Array, weight: Array) -> Array:
     return np.where(everything, 0, np.sqrt(square))
 
 
-def _blend(
-    model: Model, frame: _Frame, change: Array, visible: Array, weight: Array, dt: Array
+def blend(
+    model: Model,
+    correction: Array,
+    tracking: Array,
+    change: Array,
+    visible: Array,
+    weight: Array,
+    dt: Array,
 ) -> tuple[Array, Array]:
     """The corrections to keep, and those to add now; `[..., M, 3]`, registered frame."""
-    correction, known = frame.correction, visible[..., None]
     if np.count_nonzero(correction * weight[..., None]):
         length = np.sqrt((correction * correction).sum(-1))
         left = np.maximum(length - SHRINK_SPEED * dt[..., None], 0)
         share = np.where(visible & (length > 0), left / np.where(length > 0, length, 1), 1)
         correction = correction * share[..., None]
-    fade = np.where(frame.tracking, np.exp(-change / model.fade), 0)
-    return correction, np.where(known, correction, correction * fade[..., None, None])
+    fade = np.where(tracking, np.exp(-change / model.fade), 0)
+    return correction, np.where(visible[..., None], correction, correction * fade[..., None, None])
 
 
 def choose(condition: Array, yes: Any, no: Any) -> Any:

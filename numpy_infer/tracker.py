@@ -16,13 +16,14 @@ import numpy as np
 
 from numpy_infer import gate, one_euro, wearer
 from numpy_infer.arrays import Array
-from numpy_infer.continuity import advance, each, together
-from numpy_infer.geometry import mirror
+from numpy_infer.continuity import advance, each
+from numpy_infer.geometry import mirror, second_extent
 from numpy_infer.hand import Hand
 from numpy_infer.model import ERROR_CHANGES, Model, load
+from numpy_infer.offline import together
 from numpy_infer.one_euro import Filter, Smoothing
 from numpy_infer.output import hand_pose, smoothed, wrist_pose
-from numpy_infer.pose import HandPose, State
+from numpy_infer.pose import DETERMINED_EXTENT, HandPose, State
 from numpy_infer.predictors import PREDICTORS
 
 FARTHEST = 1e5
@@ -113,7 +114,7 @@ def run(
     Returns:
         The state after the last frame; the poses, everything in them with T in front.
     """
-    # Frames between which no visible set changes are done together, and the poses of all.
+    # Frames in which nothing is out of the ordinary are done together, and the poses of all.
     markers, visible, elapsed, late = _cleaned(state, markers, visible, dt)
     count = len(markers)
     shown = {
@@ -123,9 +124,9 @@ def run(
     }
     begins = np.ones(count, bool)
     if PREDICTORS[model.predictor].of_frame is not None:
-        alone = late.any(tuple(range(1, late.ndim)))
-        begins[1:] = (visible[1:] != visible[:-1]).any(tuple(range(1, visible.ndim)))
-        begins[1:] |= alone[1:] | alone[:-1]
+        determined = second_extent(markers, visible.astype(markers.dtype)) > DETERMINED_EXTENT
+        alone = (late | ~determined).any(tuple(range(1, late.ndim)))
+        begins[1:] = alone[1:] | alone[:-1]
         if model.gate:
             begins |= gate.unquiet(markers, visible, elapsed)
     starts = [*np.flatnonzero(begins), count]

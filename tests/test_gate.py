@@ -401,8 +401,9 @@ def test_jax_decides_as_numpy_does_in_either_precision(seed: int, pattern: str) 
         reference, own = run(model, given_)
         np.testing.assert_array_equal(accepted, reference)
         for name, value in own._asdict().items():
-            # Velocities are differences of two roundings of a metre, over a frame.
-            atol = 1e-4 if name == "velocity" else 1e-5
+            # Velocities are differences of two roundings of a metre, over a frame; a leap is what a
+            # fit leaves that may go by three markers near a line, and turn by many roundings.
+            atol = 1e-4 if name in ("velocity", "leap") else 1e-5
             np.testing.assert_allclose(getattr(state, name), value, atol=atol, err_msg=name)
 
 

@@ -32,8 +32,8 @@ ONE_SIDED = {
     # An IMU glove's rotations are no angles; the runtime has its fingers from angles. The forms of
     # a hand are one function for both sides.
     "skeleton": {"align_fingers", "finger_forms", "end_arms"},
-    # Many steady frames at once: JAX scans over them.
-    "continuity": {"together", "each"},
+    # For many frames at once, in `offline`: JAX scans over them.
+    "continuity": {"blend", "blended", "each", "fill", "posture_change"},
     "gate": {"quietly", "unquiet", "reach"},  # and a table that both sides share
     # The spec and its file format exist once, in numpy; the flax module only beside JAX.
     "networks": {
