@@ -25,6 +25,7 @@ import jax.numpy as jnp
 
 from jaxhand.compiled import apart
 from jaxhand.geometry import kabsch, mean_point, second_extent, transform
+from jaxhand.output import leading
 from numpy_infer.arrays import Array
 from numpy_infer.gate import (
     BRIEFEST,
@@ -114,7 +115,7 @@ def step(
     quick = _quietly(state, markers, moved, visible, jnp.maximum(dt, BRIEFEST))
     merged = GateState(
         *(
-            jnp.where(_leading(quiet, new), new, jnp.where(_leading(repeated, old), old, other))
+            jnp.where(leading(quiet, new), new, jnp.where(leading(repeated, old), old, other))
             for old, new, other in zip(state, quick, careful, strict=True)
         )
     )
@@ -288,8 +289,3 @@ def _impossible(known: Reach, markers: Array, candidates: Array) -> Array:
 def _spread(markers: Array, weight: Array) -> Array:
     """`[...]` True where the markers determine the hand's pose."""
     return second_extent(markers, weight.astype(markers.dtype)) > DETERMINED_EXTENT
-
-
-def _leading(condition: Array, values: Array) -> Array:
-    """`condition [...]` with axes of 1 behind, to go with `values [..., …]`."""
-    return condition.reshape(condition.shape + (1,) * (values.ndim - condition.ndim))

@@ -153,5 +153,5 @@ def _cleaned(
     visible = visible & (jnp.abs(markers) < FARTHEST).all(-1)
     markers = jnp.where(visible[..., None], markers, 0).astype(dtype)
     markers = jnp.where(state.right[..., None, None], mirror(markers), markers)
-    late = ~(dt > 0)
+    late = jnp.logical_not(dt > 0)
     return markers, visible, jnp.where(late, 0, jnp.minimum(dt, LONGEST)).astype(dtype), late

@@ -2,6 +2,7 @@
 
 from numpy_infer.hand import Hand, load_hand
 from numpy_infer.model import Model
+from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import HandPose, Notice, Status, TrackingState
 from numpy_infer.tracker import HandTracker
 
@@ -11,6 +12,7 @@ __all__ = [
     "HandTracker",
     "Model",
     "Notice",
+    "Smoothing",
     "Status",
     "TrackingState",
     "load_hand",

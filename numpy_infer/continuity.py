@@ -58,14 +58,14 @@ def advance(
         own, accepted = gate.step(
             model, state.gate, markers, visible, state.output, state.tracked, dt
         )
-    rejected = visible & ~accepted
-    if np.count_nonzero(rejected):
         markers = np.where(accepted[..., None], markers, 0)
     weight = accepted.astype(markers.dtype)
     frame = _steady(model, state, markers, accepted, weight, dt)
     if frame is None:
         frame = _unsteady(model, state, markers, accepted, weight, dt)
-    new_state = blended(model, state, frame, markers, accepted, weight, dt, own, rejected)
+    new_state = blended(model, state, frame, markers, accepted, weight, dt)
+    if model.gate:
+        new_state = new_state._replace(gate=own, rejected=visible & ~accepted)
     if np.count_nonzero(late):
         same = (accepted == state.visible).all(-1) & (markers == state.markers).all((-1, -2))
         new_state = choose(late & state.known.any(-1) & same, state, new_state)
@@ -80,10 +80,8 @@ def blended(
     visible: Array,
     weight: Array,
     dt: Array,
-    own: Any,
-    rejected: Array,
 ) -> State:
-    """The state after a frame: output and wrist, with corrections added. `own` is the gate's."""
+    """The state after a frame: output and wrist, with corrections added."""
     correction, placed, exact = frame.correction, frame.registered, frame.exact
     change = posture_change(frame, visible, weight)
     if model.continuity and np.count_nonzero(correction):
@@ -97,8 +95,8 @@ def blended(
     rotation, position = frame.wrist or wrist_pose(model, output, frame.rotation)
     return State(
         right=state.right,
-        gate=own,
-        rejected=rejected,
+        gate=state.gate,
+        rejected=np.zeros_like(visible),
         predictor=frame.predictor,
         smoothing=state.smoothing,
         output=output,

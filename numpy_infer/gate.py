@@ -29,6 +29,7 @@ from numpy_infer.arrays import Array
 from numpy_infer.geometry import kabsch, mean_point, second_extent, transform
 from numpy_infer.hand import ANGLES, JOINTS, PARENTS, Hand
 from numpy_infer.model import Model
+from numpy_infer.output import leading
 from numpy_infer.pose import DETERMINED_EXTENT
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
@@ -166,6 +167,7 @@ def init(model: Model, batch: tuple[int, ...] = ()) -> GateState:
         model: its hand is what is known of distances.
         batch: leading shape of everything.
     """
+    reach(model.hand)  # takes a frame and a half, so not in the first one that needs it
     shape, dtype = (*batch, len(model.hand)), model.hand.template.dtype
     never, nowhere = np.zeros(shape, bool), np.zeros((*shape, 3), dtype)
     return GateState(
@@ -222,7 +224,7 @@ def step(
     quick = _quietly(state, markers, moved, visible, np.maximum(dt, BRIEFEST))
     merged = GateState(
         *(
-            np.where(_leading(quiet, new), new, np.where(_leading(repeated, old), old, other))
+            np.where(leading(quiet, new), new, np.where(leading(repeated, old), old, other))
             for old, new, other in zip(state, quick, careful, strict=True)
         )
     )
@@ -440,8 +442,3 @@ def _impossible(known: Reach, markers: Array, candidates: Array) -> Array:
 def _spread(markers: Array, weight: Array) -> Array:
     """`[...]` True where the markers determine the hand's pose."""
     return second_extent(markers, weight.astype(markers.dtype)) > DETERMINED_EXTENT
-
-
-def _leading(condition: Array, values: Array) -> Array:
-    """`condition [...]` with axes of 1 behind, to go with `values [..., …]`."""
-    return condition.reshape(condition.shape + (1,) * (values.ndim - condition.ndim))

@@ -319,6 +319,11 @@ def hand_from_json(data: Any) -> Hand:
         link = marker.get("link", carrier)
         if link not in JOINTS:
             raise ValueError(f"marker {name!r}: unknown link {link!r}, expected one of {JOINTS}")
+        chain = {JOINTS.index(link), POINTS.index(joint)}
+        if link != "wrist" and not any(chain <= set(finger) for finger in CHAINS):
+            raise ValueError(
+                f"marker {name!r}: {joint!r} is not on the finger of its link {link!r}"
+            )
         names.append(name)
         joints.append(POINTS.index(joint))
         links.append(JOINTS.index(link))

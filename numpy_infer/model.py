@@ -119,6 +119,12 @@ class Model:
                 raise ValueError(f"smoothing: expected positive cutoffs, received {self.smoothing}")
         if self.joints not in ("learned", "none"):
             raise ValueError(f"unknown joint stage {self.joints!r}: expected 'learned' or 'none'")
+        if isinstance(self.fade, int | float) and not 0 < self.fade < inf:
+            raise ValueError(f"'fade' must be positive metres, found {self.fade}")
+        if isinstance(self.faded_error, int | float) and not 0 <= self.faded_error < inf:
+            raise ValueError(f"'faded_error' must not be negative, found {self.faded_error}")
+        if isinstance(self.expected_error, np.ndarray):
+            _check_errors(self.expected_error, self.error_factors, len(self.hand))
         inputs = 3 * len(self.hand)
         for name, network, needed, outputs in (
             ("marker_network", self.marker_network, self.predictor == "learned", inputs),
@@ -169,7 +175,6 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
     except TypeError as error:
         raise ValueError(f"'training' must be plain data: {error}") from None
     _check_header(header)
-    _check_errors(arrays, len(model.hand))
     header["checksum"] = _checksum(header, arrays)
     text = json.dumps(header, indent=1).encode()
     buffer = io.BytesIO()
@@ -287,7 +292,7 @@ def _read(archive: zipfile.ZipFile) -> Model:
     arrays = {name: _array(archive, name, shape) for name, shape in shapes.items()}
     table = (None, len(ERROR_CHANGES))
     arrays["expected_error"] = _array(archive, "expected_error", table, HEADER_LIMIT)
-    _check_errors(arrays, len(hand))
+    _check_errors(arrays["expected_error"], arrays["marker_error"], len(hand))
     checksum = header.pop("checksum")
     if _checksum(header, arrays) != checksum:
         raise ValueError("the checksum does not fit: the file is damaged")
@@ -315,20 +320,13 @@ def _check_header(header: Mapping[str, Any]) -> None:
     for key, kind in kinds.items():
         if not isinstance(header[key], kind):
             raise ValueError(f"header: expected {key!r} as {kind.__name__}, found {header[key]!r}")
-    if not 0 < header["fade"] < float("inf"):
-        raise ValueError(f"header: 'fade' must be positive metres, found {header['fade']}")
-    if not 0 <= header["faded_error"] < float("inf"):
-        raise ValueError(
-            f"header: 'faded_error' must not be negative, found {header['faded_error']}"
-        )
 
 
-def _check_errors(arrays: Mapping[str, Array], markers: int) -> None:
-    table, factors = arrays["expected_error"], arrays["marker_error"]
+def _check_errors(table: Array, factors: Array, markers: int) -> None:
     fits = table.ndim == 2 and len(table) and table.shape[1] == len(ERROR_CHANGES)
-    if not fits or not np.isfinite(table).all():
+    if not fits or not (np.isfinite(table) & (table >= 0)).all():
         raise ValueError(
-            f"array 'expected_error': expected finite [K, {len(ERROR_CHANGES)}], "
+            f"array 'expected_error': expected finite [K, {len(ERROR_CHANGES)}], none negative, "
             f"found {table.shape}"
         )
     if factors.shape != (markers,) or not (np.isfinite(factors) & (factors >= 0)).all():

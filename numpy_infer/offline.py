@@ -82,8 +82,8 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
             **_chained(model, state, frames, changes, visible, elapsed, changed, at)
         )
     state = state._replace(known=state.known | np.logical_or.accumulate(visible, 0))
-    rejected = np.zeros_like(visible[:1])
-    return blended(model, state, frames, markers, visible, weight, elapsed, own, rejected)
+    states = blended(model, state, frames, markers, visible, weight, elapsed)
+    return states._replace(gate=own)
 
 
 class _Changes(NamedTuple):

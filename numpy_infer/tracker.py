@@ -187,7 +187,7 @@ def _cleaned(
     markers = np.where(visible[..., None], markers, 0).astype(dtype, copy=False)
     if np.count_nonzero(state.right):
         markers = np.where(state.right[..., None, None], mirror(markers), markers)
-    late = ~(dt > 0)
+    late = np.logical_not(dt > 0)  # a Python float's `~` would be a number
     elapsed = np.minimum(dt, LONGEST)
     if np.count_nonzero(late):
         elapsed = np.where(late, 0, elapsed)
@@ -266,6 +266,9 @@ class HandTracker:
             raise ValueError(f"visible: expected shape {expected[:-1]}, received {shown.shape}")
         elapsed = np.asarray(dt, np.float64)
         if elapsed.shape != self._right.shape:
+            if elapsed.shape:
+                shapes = " or ".join(str(shape) for shape in sorted({(), self._right.shape}))
+                raise ValueError(f"dt: expected shape {shapes}, received {elapsed.shape}")
             elapsed = np.broadcast_to(elapsed, self._right.shape)
         self._state, pose = step(self.model, self._state, markers, shown, elapsed)
         return pose

@@ -89,6 +89,14 @@ REFUSALS = {
     "unknown joint": (lambda d: d["markers"][2].update(joint="elbow"), "index_base.*'elbow'"),
     "joint a list": (lambda d: d["markers"][2].update(joint=["wrist"]), "index_base"),
     "unknown link": (lambda d: d["markers"][2].update(link="elbow"), "index_base.*'elbow'"),
+    "link of another finger": (
+        lambda d: d["markers"][2].update(link="pinky_mcp"),
+        "index_base.*not on the finger of its link 'pinky_mcp'",
+    ),
+    "joint of no finger on a finger's link": (
+        lambda d: d["markers"][2].update(joint="wrist", link="index_mcp"),
+        "index_base.*'wrist' is not on the finger",
+    ),
     "link a tip": (lambda d: d["markers"][2].update(link="index_tip"), "index_base.*'index_tip'"),
     "duplicate marker": (lambda d: d["markers"][1].update(name="index_base"), "'index_base'"),
     "offset short": (lambda d: d["markers"][3].update(offset=[0, 0]), "'ring_tip'.*3 numbers"),

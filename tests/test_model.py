@@ -146,16 +146,6 @@ def test_a_model_appears_whole_or_not_at_all(
         ({"training": {"loss": float("nan")}}, "JSON compliant"),
         ({"training": {"loss": np.float32(1)}}, "'training' must be plain data"),
         ({"training": {"path": Path("x")}}, "'training' must be plain data"),
-        ({"fade": 0.0}, "'fade' must be positive"),
-        ({"fade": float("inf")}, "JSON compliant"),
-        ({"expected_error": np.zeros((4, 5))}, "expected_error"),
-        ({"expected_error": np.full((4, 6), np.nan)}, "expected_error"),
-        ({"expected_error": np.zeros((0, 6))}, "expected_error"),
-        ({"marker_error": np.ones(8)}, "marker_error"),
-        ({"marker_error": np.full(9, np.nan)}, "marker_error"),
-        ({"marker_error": np.full(9, -1.0)}, "marker_error"),
-        ({"faded_error": -0.5}, "'faded_error' must not be negative"),
-        ({"faded_error": float("inf")}, "JSON compliant"),
     ],
 )
 def test_what_could_not_be_read_back_is_not_written(
@@ -164,6 +154,29 @@ def test_what_could_not_be_read_back_is_not_written(
     with pytest.raises(ValueError, match=message):
         save(replace(a_model("none"), **changes), tmp_path / "m.npz")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fade": 0.0}, "'fade' must be positive"),
+        ({"fade": float("inf")}, "'fade' must be positive"),
+        ({"expected_error": np.zeros((4, 5))}, "expected_error"),
+        ({"expected_error": np.full((4, 6), np.nan)}, "expected_error"),
+        ({"expected_error": np.full((4, 6), -1e-4)}, "expected_error"),
+        ({"expected_error": np.zeros((0, 6))}, "expected_error"),
+        ({"marker_error": np.ones(8)}, "marker_error"),
+        ({"marker_error": np.full(9, np.nan)}, "marker_error"),
+        ({"marker_error": np.full(9, -1.0)}, "marker_error"),
+        ({"faded_error": -0.5}, "'faded_error' must not be negative"),
+        ({"faded_error": float("inf")}, "'faded_error' must not be negative"),
+    ],
+)
+def test_what_a_live_frame_would_fail_on_is_refused_when_the_model_is_made(
+    changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(a_model("none"), **changes)
 
 
 def test_a_model_whose_parts_do_not_fit_is_refused_when_it_is_made(model: Model) -> None:

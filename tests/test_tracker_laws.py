@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import importlib
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -233,8 +236,36 @@ def test_a_wrong_shape_is_refused_with_what_was_expected_and_received() -> None:
     ]:
         with pytest.raises(ValueError, match=message):
             hand_tracker.step(markers, 0.01, visible)
+    with pytest.raises(ValueError, match=r"dt: expected shape \(\) or \(2,\), received \(3,\)"):
+        hand_tracker.step(good, [0.01] * 3)
+    with pytest.raises(ValueError, match=r"dt: expected shape \(\), received \(2,\)"):
+        HandTracker(a_model("affine")).step(good[0], [0.01] * 2)
     with pytest.raises(ValueError, match="unknown predictor 'kalman'"):
         HandTracker(a_model("kalman"))
+
+
+@pytest.mark.parametrize("package", ["numpy_infer", "jaxhand"])
+def test_time_may_be_any_number(package: str) -> None:
+    """A Python float is one: its `~` is not that of an array."""
+    pytest.importorskip("jax" if package == "jaxhand" else "numpy")
+    side = importlib.import_module(f"{package}.tracker")
+    model = a_model("moving_average", dtype=np.float32)
+    markers = motion(model.hand, np.random.default_rng(0), 12, 1)[:, 0].astype(np.float32)
+    visible = np.ones(markers.shape[:-1], bool)
+    visible[6:, 4] = False
+
+    def last(number: Callable[[float], Any]) -> Any:
+        state = side.init(model)
+        for frame, seen in zip(markers, visible, strict=True):
+            state, pose = side.step(model, state, frame, seen, number(1 / 60))
+        return pose
+
+    expected = last(lambda dt: np.array(dt, np.float32))
+    assert expected.notice == 0
+    for number in (float, np.float64, np.float32, lambda dt: np.array(dt)):
+        pose = last(number)
+        assert pose.notice == 0
+        assert_allclose(pose.markers, expected.markers, rtol=0, atol=1e-6)
 
 
 def test_the_live_object_is_the_pure_pair_and_reset_forgets_all() -> None:
