@@ -13,6 +13,7 @@ pytest.importorskip("jax")
 
 import tyro
 
+from jaxhand import evaluation, predictors
 from jaxhand.demo import DemoConfig
 from jaxhand.glove import CalibrateConfig, HandConfig
 from jaxhand.occlusions import OcclusionsConfig
@@ -65,9 +66,11 @@ def test_the_python_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         assert suite
         for name in suite:
             space[name]()  # type: ignore[operator]
+        assert "template" in evaluation.methods(Model(hand)), "a row of its own"
     finally:
         for name in ("mine", "template"):
             PREDICTORS.pop(name, None)
+            predictors.PREDICTORS.pop(name, None)
     assert np.isfinite(space["pose"].markers).all()  # type: ignore[attr-defined]
     assert blocks("python")
 
