@@ -11,10 +11,12 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from jaxhand.expected_error import people
+import jax
+
+from jaxhand import simulation
 from jaxhand.export import export, finish, with_expected_error
 from jaxhand.training import TrainingConfig, train
-from jaxhand.training_data import simulated_sequences
+from jaxhand.training_data import PEOPLE, SECONDS
 from numpy_infer.hand import bundled
 from numpy_infer.model import load
 
@@ -33,14 +35,16 @@ def main() -> None:
         file = options.out / f"{hand}.npz"
         if options.finish:
             model = load(file)
-            model = finish(model, simulated_sequences(model.hand, seed=0), print)
+            moving = simulation.sequences(jax.random.key(0), model.hand, PEOPLE, SECONDS)
+            model = finish(model, moving, print)
         else:
             run = options.runs / f"bundled_{hand}"
             epochs = options.epochs
             train(TrainingConfig(("simulated",), run, hand=hand, epochs=epochs, overwrite=True))
             options.out.mkdir(parents=True, exist_ok=True)
             model = load(run / "model.npz")
-        model = with_expected_error(model, people(model.hand, seed=1), print)
+        others = simulation.sequences(jax.random.key(1), model.hand)
+        model = with_expected_error(model, others, print)
         export(model, file, overwrite=True)
         print(f"wrote {file}", flush=True)
 

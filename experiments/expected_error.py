@@ -12,10 +12,11 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import replace
 
+import jax
 import numpy as np
 
-from jaxhand import datasets
-from jaxhand.expected_error import Samples, measure, people
+from jaxhand import datasets, simulation
+from jaxhand.expected_error import Samples, measure
 from jaxhand.export import with_expected_error
 from jaxhand.sequences import Sequence as MarkerSequence
 from jaxhand.training_data import SIMULATED
@@ -44,7 +45,7 @@ def main() -> None:
 def takes(spec: str, split: datasets.Split, hand: Hand) -> Sequence[MarkerSequence]:
     """Of a data set; or of simulated people, other ones for the test."""
     if spec == SIMULATED:
-        return people(hand, seed=1 if split == "validation" else 2)
+        return simulation.sequences(jax.random.key(1 if split == "validation" else 2), hand)
     return datasets.load(spec, split, hand=hand).sequences
 
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxhand import datasets
+from jaxhand.sequences import RATE, Dataset
 from numpy_infer import gate, tracker
 from numpy_infer.arrays import Array
 from numpy_infer.model import Model, load
@@ -122,7 +123,7 @@ def faults(spec: str, split: datasets.Split, seeds: int, look: Path | None) -> N
         )
 
 
-def streams(data: datasets.Dataset) -> list[Array]:
+def streams(data: Dataset) -> list[Array]:
     """`[T, H, M, 3]` metres: all sequences cut into streams of one length, and the short rests."""
     blocks: dict[int, list[Array]] = {}
     for sequence in data.sequences:
@@ -140,7 +141,7 @@ def misplaced(truth: Array, pairs: Array, level: float, rng: np.random.Generator
         wanted, tries = level / len(SECONDS) * kind.size, 0
         while (kind == number).sum() < wanted and tries < 10000:
             tries += 1
-            length = round(datasets.RATE * (least + rng.exponential(more)))
+            length = round(RATE * (least + rng.exponential(more)))
             start, hand = int(rng.integers(1, frames)), int(rng.integers(hands))
             own = pairs[rng.integers(len(pairs))] if number == 2 else [rng.integers(count)]
             part = (slice(start, start + length), hand)
@@ -165,7 +166,7 @@ def track(
 ) -> tuple[Array, Array]:
     """`[T, H, M]` True where accepted, `[T, H, M, 3]` the tracker's markers."""
     model = replace(model, gate=gated)
-    dt = np.full(visible.shape[:-1], 1 / datasets.RATE)
+    dt = np.full(visible.shape[:-1], 1 / RATE)
     start = tracker.init(model, visible.shape[1:-1])
     _, pose = tracker.run(model, start, markers, visible, dt)
     return visible & (pose.status != Status.REJECTED), pose.markers

@@ -16,15 +16,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from jaxhand.sequences import (
-    RATE,
-    CompleteFrames,
-    Dataset,
-    Sequence,
-    complete_frames,
-    resample,
-    smooth,
-)
+from jaxhand.sequences import RATE, Dataset, Sequence, resample, smooth
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import (
     kabsch,
@@ -49,22 +41,9 @@ from numpy_infer.hand import (
 from numpy_infer.recordings import READER_OF, Recording, load_label_map, read
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
-__all__ = [
-    "RATE",
-    "SOURCES",
-    "CompleteFrames",
-    "Dataset",
-    "DatasetSpec",
-    "Sequence",
-    "Split",
-    "complete_frames",
-    "load",
-    "parse_spec",
-    "resample",
-    "smooth",
-]
-
 Split = Literal["train", "validation", "test"]
+OWN = "recordings"
+"""The data set that is whoever's own files."""
 MIN_FRAMES = 24
 """SIG18's shorter sequences are dropped."""
 OBSERVED = np.radians(10)
@@ -207,9 +186,6 @@ def _sequence(recording: Recording, hand: Hand, take: str, side: str) -> Sequenc
     markers = (mirror(markers) if side == "right" else markers).astype(np.float32)
     return Sequence(f"{take}/{side}", take, RATE, markers)
 
-
-OWN = "recordings"
-"""The data set that is whoever's own files."""
 
 SIG18_AS_GLOVE9 = {
     "PinkyMCP": "pinky_base",
@@ -414,11 +390,12 @@ def _skeleton(points: Array) -> Array:
 
 
 def _files(pattern: str, take: Callable[[Path], str]) -> Callable[[Path], dict[str, list[Path]]]:
-    """Finds the files of a folder that match, or the one file given, by take."""
+    """Finds the files of a folder that match, or the one file given if it does, by take."""
 
     def found(path: Path) -> dict[str, list[Path]]:
         files: dict[str, list[Path]] = {}
-        for file in sorted(path.glob(pattern)) if path.is_dir() else [path]:
+        one = [path] if path.match(pattern) else []
+        for file in sorted(path.glob(pattern)) if path.is_dir() else one:
             if file.name.startswith("."):
                 continue
             if file.suffix.lower() in SUFFIXES and not file.name.startswith("out_fused_"):

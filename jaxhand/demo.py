@@ -106,7 +106,7 @@ def demo(config: DemoConfig) -> None:
     model = _train(hand, people, size, config.seed, console)
     if not config.short:
         with _progress(console, "choosing the blend on validation"):
-            model = finish(model, simulation.sequences(people.validation))
+            model = finish(model, people.validation.sequences())
     config.out.mkdir(parents=True, exist_ok=True)
     path = config.out / "model.npz"
     export(model, path, overwrite=config.overwrite)
@@ -118,7 +118,7 @@ def demo(config: DemoConfig) -> None:
         def report(name: str, share: float) -> None:
             bar((list(rows).index(name) + share) / len(rows))
 
-        test = simulation.sequences(people.test)
+        test = people.test.sequences()
         table = evaluation.table3(rows, test, seeds=size.seeds, report=report)
     print_table3(table, console)
     text = json.dumps({"table3": table}, indent=1)

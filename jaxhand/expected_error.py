@@ -18,7 +18,6 @@ from jaxhand import sequences as data
 from jaxhand import simulation
 from numpy_infer import tracker
 from numpy_infer.arrays import Array
-from numpy_infer.hand import Hand
 from numpy_infer.model import ERROR_CHANGES, Model
 
 PIECE = 600
@@ -34,18 +33,6 @@ FEWEST = 500
 """Hidden markers: fewer say nothing of a table."""
 
 ITERATIONS = 300
-
-
-PEOPLE, SECONDS = 64, 10
-"""Of simulated sequences to measure on."""
-
-
-def people(
-    hand: Hand, seed: int, count: int = PEOPLE, seconds: float = SECONDS
-) -> list[data.Sequence]:
-    """Simulated people in motion, each with bones of their own and markers not quite in place."""
-    frames = round(seconds * data.RATE)
-    return simulation.sequences(simulation.streams(jax.random.key(seed), hand, count, frames))
 
 
 class Samples(NamedTuple):

@@ -1,7 +1,7 @@
 """Frames and recordings of hands out of a random key, to train on before there are real ones.
 
 Everything is a canonical left hand in metres, seconds and radians, float32. The same key gives the
-same result; every function but `sequences` is pure, and safe under jit and vmap.
+same result; every function is pure, and but for `sequences` safe under jit and vmap.
 """
 
 from __future__ import annotations
@@ -87,6 +87,13 @@ class Streams(NamedTuple):
     time: Array
     """`[T]` seconds."""
 
+    def sequences(self) -> list[Sequence]:
+        """Without their gaps, as evaluations take them; the streams are at 60 Hz."""
+        return [
+            Sequence(f"person {i}", f"person {i}", RATE, markers)
+            for i, markers in enumerate(np.asarray(self.markers))
+        ]
+
 
 def poses(key: Array, batch: tuple[int, ...] = ()) -> Array:
     """`[..., 26]` radians: postures as `POSE_KINDS` describes them, inside of the angles' ranges.
@@ -157,12 +164,11 @@ def streams(key: Array, hand: Hand, count: int, frames: int, rate: float = RATE)
     )
 
 
-def sequences(recorded: Streams) -> list[Sequence]:
-    """Streams at 60 Hz without their gaps, as evaluations take them."""
-    return [
-        Sequence(f"person {i}", f"person {i}", RATE, markers)
-        for i, markers in enumerate(np.asarray(recorded.markers))
-    ]
+def sequences(key: Array, hand: Hand, count: int = 64, seconds: float = 10) -> list[Sequence]:
+    """People in motion without gaps, to validate and measure on. Each has bones of their own and
+    markers not quite in place: on gloves put on by the millimetre a network looks better than it
+    will be. As many as by default are enough to measure what error to expect."""
+    return streams(key, hand, count, round(seconds * RATE)).sequences()
 
 
 def frames(key: Array, hand: Hand, count: int) -> tuple[Array, Array]:

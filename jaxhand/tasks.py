@@ -208,11 +208,6 @@ mean_square_of_measured = jax.tree_util.Partial(_mean_square_of_measured)
 """The same over the markers that were measured."""
 
 
-def as_is(key: Array, frames: tuple[Array, Array]) -> tuple[Array, Array]:
-    """The `Task.prepare` of frames that are inputs and targets already."""
-    return frames
-
-
 def joint_points(skeleton: Array, angles: Array) -> Array:
     """`[N, 15, 3]` metres, hand frame: where the angles put the points of `JOINT_POINTS`."""
     eye = jnp.broadcast_to(jnp.eye(3), (len(angles), 3, 3))
@@ -228,9 +223,6 @@ class Augmentation(NamedTuple):
     """Share of frames in which each finger is taken from another frame."""
     drawn: float
     """Share of frames that are drawn postures, on the training skeleton."""
-    simulated: float = 0.0
-    """Share of frames that are other people, see `Frames.simulated`; the rest are what the others
-    are shares of."""
 
 
 def mix_fingers(key: Array, hand: Hand, markers: Array, angles: Array) -> tuple[Array, Array]:
@@ -255,15 +247,17 @@ FINGER_OF_JOINT = (-1, *np.repeat(np.arange(len(FINGERS)), 3).tolist())
 """For each joint of `hand.JOINTS` the index of its finger in `FINGERS`; −1 for the wrist."""
 
 
-@partial(jax.jit, static_argnames=("augmentation", "hand"))
+@partial(jax.jit, static_argnames=("augmentation", "simulated", "hand"))
 def _joint_frames(
     key: Array,
     frames: tuple[Array, Array],
     augmentation: Augmentation,
+    simulated: float,
     hand: Hand,
     network: Network,
     point_scale: Array,
 ) -> tuple[Array, Array]:
+    """`Task.prepare`. simulated: see `Frames.simulated`; what is augmented is the rest."""
     markers, angles = frames
     mix_key, share_key, draw_key = jax.random.split(key, 3)
     share = jax.random.uniform(share_key, (len(markers), 1))
@@ -278,10 +272,10 @@ def _joint_frames(
         chosen = share > 1 - augmentation.drawn
         markers = jnp.where(chosen[..., None], drawn, markers)
         angles = jnp.where(chosen, drawn_angles, angles)
-    if augmentation.simulated:
+    if simulated:
         # People differ in where the alignment markers put their hand frame.
         fresh_key = jax.random.fold_in(key, 1)
-        markers, angles = _renewed(fresh_key, hand, augmentation.simulated, markers, angles)
+        markers, angles = _renewed(fresh_key, hand, simulated, markers, angles)
         markers = align(markers, hand)
     inputs = (markers.reshape(len(markers), -1) - network.input_mean) / network.input_scale
     return inputs, _joint_targets(angles, hand.skeleton, network, point_scale)
@@ -344,7 +338,6 @@ def joint_task(
     the network to go on from, instead of a new one with layers `hidden`."""
     markers, angles, weight = _aligned(training, hand)
     held_out, truth, _ = _aligned(validation, hand)
-    augmentation = augmentation._replace(simulated=training.simulated)
     network = start or _new_joint_network(markers, angles, key, hidden)
     skeleton = jnp.asarray(hand.skeleton, jnp.float32)
     points = joint_points(skeleton, angles)
@@ -364,7 +357,13 @@ def joint_task(
         network=network,
         frames=(markers, angles),
         weight=weight,
-        prepare=partial(_joint_frames, augmentation=augmentation, hand=hand, **shared),
+        prepare=partial(
+            _joint_frames,
+            augmentation=augmentation,
+            simulated=training.simulated,
+            hand=hand,
+            **shared,
+        ),
         loss=loss,
         measure=partial(
             _joint_error,
@@ -387,11 +386,15 @@ def _new_joint_network(markers: Array, angles: Array, key: Array, hidden: Spec) 
     return _untrained(hidden, mean, scale, angle_mean, angle_scale, key)
 
 
+def complete(frames: Frames) -> Array:
+    """`[N]` True where a frame has joint truth and all markers: what a joint network is shown."""
+    angles = np.isfinite(np.asarray(frames.angles)).all(-1)
+    return angles & np.isfinite(np.asarray(frames.markers)).all((-1, -2))
+
+
 def _aligned(frames: Frames, hand: Hand) -> tuple[Array, Array, Array | None]:
-    """Markers `[N, M, 3]` metres, hand frame, angles `[N, 26]` and weights of the frames with joint
-    truth and all markers."""
-    known = np.isfinite(np.asarray(frames.angles)).all(-1)
-    known &= np.isfinite(np.asarray(frames.markers)).all((-1, -2))
+    """Markers `[N, M, 3]` metres, hand frame, angles `[N, 26]` and weights of complete frames."""
+    known = complete(frames)
     angles = jnp.asarray(np.asarray(frames.angles)[known], jnp.float32)
     markers = jnp.asarray(np.asarray(frames.markers)[known], jnp.float32)
     weight = _weight(frames)

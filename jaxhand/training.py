@@ -23,9 +23,10 @@ import optax
 from rich.console import Console
 
 from jaxhand import runs
+from jaxhand.datasets import OWN, parse_spec
 from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
-from jaxhand.occlusions import FEWEST_LEFT, Occlusions, of_layout
+from jaxhand.occlusions import Occlusions, of_layout
 from jaxhand.options import DataSets, Layers, Takes
 from jaxhand.sparse_fit import prior_of
 from jaxhand.tasks import (
@@ -36,7 +37,7 @@ from jaxhand.tasks import (
     marker_task,
     mean_square,
 )
-from jaxhand.training_data import collect
+from jaxhand.training_data import SIMULATED, check_frames, check_joint_frames, collect
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
 from numpy_infer.model import Model
@@ -138,8 +139,12 @@ class TrainingConfig:
             )
         if self.resume and self.overwrite:
             raise ValueError("resume and overwrite exclude each other")
-        if (self.train or self.validation) and len(self.data) != 1:
-            raise ValueError("takes can be named for one data set only")
+        names = [parse_spec(text).name for text in self.data]
+        found = f"found {', '.join(names) or 'none'}"
+        if (self.train or self.validation) and len(names) - names.count(SIMULATED) != 1:
+            raise ValueError(f"train and validation name takes of one data set, {found}")
+        if (self.unit is not None or self.left_handed) and OWN not in names:
+            raise ValueError(f"unit and left_handed are for {OWN}, {found}")
 
 
 class Metrics(NamedTuple):
@@ -284,6 +289,7 @@ def fit_networks(
         folder: where metrics and checkpoints are kept and, if there are any, gone on from; None
             keeps nothing.
         joint_frames: frames to train and validate the joint network on instead; with angles.
+            Of either kind, those with all markers and all angles count.
         start: a model of the same hand, whose networks are trained further.
 
     Raises:
@@ -294,8 +300,13 @@ def fit_networks(
         config = replace(config, **PAPER_JOINTS)
     if not config.joints:
         training, validation = (x._replace(angles=None) for x in (training, validation))
-    _check_frames("training", training, hand, config.batch)
-    _check_frames("validation", validation, hand, 1)
+    check_frames("training", training, hand, config.batch)
+    check_frames("validation", validation, hand, 1)
+    if joint_frames is None and training.angles is not None and validation.angles is not None:
+        joint_frames = training, validation
+    if joint_frames is not None:
+        check_joint_frames("training", joint_frames[0], hand, config.batch)
+        check_joint_frames("validation", joint_frames[1], hand, 1)
     occlusions: tuple[float, ...] | Occlusions
     if isinstance(config.occlusions, str):
         occlusions = of_layout(config.occlusions, hand.markers)
@@ -312,8 +323,7 @@ def fit_networks(
             start=start.marker_network if start else None,
         )
     ]
-    joint_frames = joint_frames or (training, validation)
-    if all(frames.angles is not None for frames in joint_frames):
+    if joint_frames is not None:
         tasks.append(
             partial(
                 joint_task,
@@ -345,7 +355,7 @@ def fit_networks(
     if not networks:
         raise KeyboardInterrupt
     joints = "learned" if "joint_network" in networks else "none"
-    if joint_frames[0].angles is None:
+    if joint_frames is None:
         if start is not None and "posture" in start.training:
             summary["posture"] = start.training["posture"]
     elif joints == "learned":
@@ -354,21 +364,6 @@ def fit_networks(
         posture = prior_of(angles[np.isfinite(angles).all(-1)])._asdict()
         summary["posture"] = {name: array.tolist() for name, array in posture.items()}
     return Model(hand, predictor="learned", joints=joints, training=summary, **networks)
-
-
-def _check_frames(what: str, frames: Frames, hand: Hand, least: int) -> None:
-    shape = np.shape(frames.markers)
-    if len(shape) != 3 or shape[1:] != (len(hand), 3):
-        raise ValueError(f"{what}: expected markers [N, {len(hand)}, 3], found {list(shape)}")
-    seen = np.isfinite(frames.markers).all(-1).sum(-1)
-    if (seen <= FEWEST_LEFT).any():
-        raise ValueError(
-            f"{what}: expected more than {FEWEST_LEFT} markers measured in every frame, found "
-            f"{seen.min()}"
-        )
-    known = shape[0] if frames.angles is None else np.isfinite(frames.angles).all(-1).sum()
-    if known < least:
-        raise ValueError(f"{what}: expected {least} or more frames, found {known}")
 
 
 def _fit(

@@ -9,10 +9,9 @@ import numpy as np
 
 from jaxhand import simulation
 from jaxhand.datasets import OWN, Split, load, parse_spec
-from jaxhand.expected_error import people
 from jaxhand.occlusions import FEWEST_LEFT
 from jaxhand.sequences import Dataset, Sequence
-from jaxhand.tasks import Frames
+from jaxhand.tasks import Frames, complete
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, Hand, load_hand
 from numpy_infer.model import Model
@@ -53,20 +52,24 @@ def collect(config: TrainingConfig) -> Given:
     start = None if config.start is None else load_model(config.start)
     recorded, held_out = (_load(config, split, start) for split in ("train", "validation"))
     specs = [parse_spec(text) for text in config.data]
-    simulated = sum(spec.weight for spec in specs if spec.name == SIMULATED)
     hand = _hand_of(config, recorded, start)
-    people = simulated_frames(hand, config.seed)
-    training, validation = people
+    made = simulated_frames(hand, config.seed)
+    training, validation = made
     if recorded:
         training, validation = gather(recorded), gather(held_out)
-        share = _share(simulated * len(people[0].markers), training)
-        training = training._replace(simulated=share)
+        weight = sum(spec.weight for spec in specs if spec.name == SIMULATED)
+        simulated, measured = weight * len(made[0].markers), _weight(training, recorded)
+        training = training._replace(simulated=simulated / (simulated + measured))
     joint_frames, notes = None, []
     if config.joints and (training.angles is None or validation.angles is None):
-        joint_frames = people if start is None or start.joint_network is None else None
+        joint_frames = made if start is None or start.joint_network is None else None
         does = "stays as it is" if joint_frames is None else f"learns simulated {hand.name} hands"
         notes.append(f"the data hold no joints: the joint network {does}")
-    sequences = _sequences(held_out, hand, config.seed)
+    if recorded:
+        sequences = [s for dataset in held_out for s in dataset.sequences]
+    else:
+        key = jax.random.key(config.seed)
+        sequences = simulation.sequences(key, hand, PEOPLE, SECONDS)
     return Given(hand, training, validation, joint_frames, sequences, start, tuple(notes))
 
 
@@ -82,22 +85,11 @@ def simulated_frames(hand: Hand, seed: int) -> tuple[Frames, Frames]:
     return Frames(markers, angles, simulated=1.0), Frames(*held_out)
 
 
-def _sequences(validation: list[Dataset], hand: Hand, seed: int) -> list[Sequence]:
-    if validation:
-        return [s for dataset in validation for s in dataset.sequences]
-    return simulated_sequences(hand, seed)
-
-
-def simulated_sequences(hand: Hand, seed: int) -> list[Sequence]:
-    """Simulated people in motion. Their markers are not quite in place: on gloves put on by the
-    millimetre a network looks better than it will be."""
-    return people(hand, seed, PEOPLE, SECONDS)
-
-
-def _share(simulated: float, frames: Frames) -> float:
-    """Of so many simulated frames beside the recorded ones, each by its weight."""
-    recorded = len(frames.markers) if frames.weight is None else frames.weight.sum()
-    return float(simulated / (simulated + recorded))
+def _weight(gathered: Frames, datasets: list[Dataset]) -> float:
+    """The sum over all frames; where the data sets weigh alike, the frames do not say how much."""
+    if gathered.weight is None:
+        return datasets[0].weight * len(gathered.markers)
+    return float(gathered.weight.sum())
 
 
 def _hand_of(config: TrainingConfig, training: list[Dataset], start: Model | None) -> Hand:
@@ -124,13 +116,13 @@ def _load(config: TrainingConfig, split: Split, start: Model | None) -> list[Dat
         hand = start.hand
     takes = config.train if split == "train" else config.validation
     truth = config.truth or False
-    recorded = [spec for spec in config.data if parse_spec(spec).name != SIMULATED]
     said: dict[str, Any] = {"unit": config.unit, "left_handed": config.left_handed}
     datasets = []
-    for spec in recorded:
-        # Beside others, it is the recordings that this is said of.
-        own = said if parse_spec(spec).name == OWN or len(recorded) == 1 else {}
-        datasets.append(load(spec, split, hand=hand, takes=takes or None, truth=truth, **own))
+    for spec in config.data:
+        name = parse_spec(spec).name
+        if name != SIMULATED:
+            own = said if name == OWN else {}
+            datasets.append(load(spec, split, hand=hand, takes=takes or None, truth=truth, **own))
     for dataset in datasets[1:]:
         if dataset.hand.markers != datasets[0].hand.markers:
             raise ValueError(
@@ -163,3 +155,49 @@ def _usable(dataset: Dataset) -> tuple[Array, Array]:
     )
     enough = np.isfinite(markers).all(-1).sum(-1) > FEWEST_LEFT
     return markers[enough], angles[enough]
+
+
+def check_frames(what: str, frames: Frames, hand: Hand, least: int) -> None:
+    """Refuses frames that a marker network cannot be trained on, or fewer than `least` of them.
+
+    Raises:
+        ValueError: says what the frames are for, what was expected and what was found.
+    """
+    _check_shapes(what, frames, hand)
+    seen = np.isfinite(frames.markers).all(-1).sum(-1)
+    if (seen <= FEWEST_LEFT).any():
+        raise ValueError(
+            f"{what}: expected more than {FEWEST_LEFT} markers measured in every frame, found "
+            f"{seen.min()}"
+        )
+    if len(seen) < least:
+        raise ValueError(f"{what}: expected {least} or more frames, found {len(seen)}")
+
+
+def check_joint_frames(what: str, frames: Frames, hand: Hand, least: int) -> None:
+    """Refuses frames of which fewer than `least` can teach a joint network anything.
+
+    Raises:
+        ValueError: says what the frames are for, what was expected and what was found.
+    """
+    what = f"{what} of the joint network"
+    _check_shapes(what, frames, hand)
+    if frames.angles is None:
+        raise ValueError(f"{what}: expected angles [N, {len(ANGLES)}], found none")
+    count = complete(frames).sum()
+    if count < least:
+        raise ValueError(
+            f"{what}: expected {least} or more frames with all markers and angles, found {count}; "
+            "joints=False trains the marker network alone"
+        )
+
+
+def _check_shapes(what: str, frames: Frames, hand: Hand) -> None:
+    shape = np.shape(frames.markers)
+    if len(shape) != 3 or shape[1:] != (len(hand), 3):
+        raise ValueError(f"{what}: expected markers [N, {len(hand)}, 3], found {list(shape)}")
+    expected = (shape[0], len(ANGLES))
+    if frames.angles is not None and np.shape(frames.angles) != expected:
+        raise ValueError(
+            f"{what}: expected angles {list(expected)}, found {list(np.shape(frames.angles))}"
+        )

@@ -16,14 +16,11 @@ from jaxhand.datasets import (
     PAVLLO_MARKERS,
     SIG18_AS_GLOVE9,
     SOURCES,
-    Dataset,
-    Sequence,
     _without_side,
-    complete_frames,
     load,
     parse_spec,
-    smooth,
 )
+from jaxhand.sequences import Dataset, Sequence, complete_frames, smooth
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import kabsch, mirror, nearest_rotation, transform
 from numpy_infer.hand import ANGLES, FINGERS, POINTS, TIPS, load_hand
@@ -80,6 +77,24 @@ def test_only_the_split_asked_for_must_be_there(tmp_path: Path) -> None:
     assert len(load(f"sig18:{tmp_path}", "test").sequences) == 1
     with pytest.raises(ValueError, match="no take User1, User2; name takes with --train"):
         load(f"sig18:{tmp_path}", "train")
+
+
+def test_one_file_is_read_where_its_folder_says_what_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stem = "sequence.1_training_dense_left"
+    write_takes(tmp_path / "User4" / "capture1", [stem])
+    file = Path("User4", "capture1", f"{stem}.trc")
+    for path in (tmp_path / file, file):
+        monkeypatch.chdir(tmp_path)
+        (sequence,) = load(f"sig18:{path}", "test").sequences
+        assert sequence.take == "User4/capture1/sequence.1"
+    for folder in ("nowhere", "User4", "User4/session1"):
+        write_takes(tmp_path / folder, [stem])
+        monkeypatch.chdir(tmp_path / folder)
+        for split in ("train", "test"):
+            with pytest.raises(ValueError, match=f"{stem}.* holds no takes: pass sig18:PATH, the"):
+                load(f"sig18:{stem}.trc", split)
 
 
 # --- recordings

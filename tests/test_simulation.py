@@ -167,11 +167,25 @@ def test_several_markers_are_hidden_at_once_now_and_then() -> None:
 
 
 def test_sequences_are_the_streams_without_their_gaps() -> None:
-    found = simulation.sequences(streams())
+    found = streams().sequences()
     assert len({s.take for s in found}) == COUNT
     for sequence, markers in zip(found, streams().markers, strict=True):
         assert sequence.rate == RATE
         np.testing.assert_array_equal(sequence.markers, markers)
+
+
+def test_sequences_of_a_key_are_those_of_its_streams(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = functools.partial(jax.random.key, 0)
+
+    def made(key: jax.Array, *asked: object) -> Streams:
+        assert (key, *asked) == (drawn(), GLOVE, COUNT, LENGTH)
+        return streams()
+
+    monkeypatch.setattr(simulation, "streams", made)
+    found = simulation.sequences(drawn(), GLOVE, COUNT, LENGTH / RATE)
+    for one, other in zip(found, streams().sequences(), strict=True):
+        assert one.name == other.name
+        np.testing.assert_array_equal(one.markers, other.markers)
 
 
 def test_still_markers_are_the_hands_own_at_rest() -> None:

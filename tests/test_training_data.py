@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from small_training import (
 )
 
 from jaxhand import training, training_data
+from jaxhand.datasets import parse_spec
 from jaxhand.tasks import Frames
 from jaxhand.training import fit_networks
 from numpy_infer.hand import load_hand
@@ -54,6 +56,123 @@ def test_data_sets_of_different_markers_are_refused(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(training_data, "load", lambda spec, split, **_: datasets[spec])
     with pytest.raises(ValueError, match=r"b has markers .* pass one --hand"):
         training.train(replace(CONFIG, data=("a", "b")))
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> None:
+    """20,000 simulated frames, without the wait."""
+    frames = Frames(np.zeros((20_000, len(HAND), 3), np.float32), simulated=1.0)
+    monkeypatch.setattr(training_data, "simulated_frames", lambda hand, seed: (frames, frames))
+
+
+@pytest.mark.usefixtures("made")
+@pytest.mark.parametrize(
+    ("data", "share"),
+    [
+        (("simulated", "recordings:a@3"), 20 / 23),
+        (("simulated", "recordings:a@1"), 20 / 21),
+        (("simulated@2", "recordings:a@3"), 40 / 43),
+        (("recordings:a@3", "recordings:b@3", "simulated"), 20 / 26),
+        (("recordings:a@3", "recordings:b@0.5", "simulated"), 20 / 23.5),
+        (("recordings:a@3", "recordings:b@1"), 0),
+    ],
+)
+def test_simulated_frames_have_the_share_that_the_weights_say(
+    data: tuple[str, ...], share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of 20,000 simulated frames beside 1,000 of each folder."""
+    frames = Frames(np.resize(TRAINING.markers, (1000, len(HAND), 3)))
+    monkeypatch.setattr(
+        training_data,
+        "load",
+        lambda spec, split, **_: make_dataset("own", frames, parse_spec(spec).weight, None),
+    )
+    given = training_data.collect(replace(CONFIG, data=data))
+    assert given.training.simulated == pytest.approx(share)
+    assert len(given.training.markers) == 1000 * sum(spec[0] == "r" for spec in data)
+
+
+@pytest.mark.usefixtures("made")
+def test_unit_and_side_are_said_of_recordings_and_takes_of_what_is_not_simulated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    told: dict[str, list[dict[str, Any]]] = {}
+
+    def load(spec: str, split: str, **options: Any) -> Any:
+        told.setdefault(spec, []).append(options)
+        return make_dataset("a", TRAINING, 1.0, 1.0)
+
+    monkeypatch.setattr(training_data, "load", load)
+    unnamed = {"hand": None, "takes": None, "truth": False}
+    said = {"unit": 7.0, "left_handed": True}
+    training_data.collect(replace(CONFIG, data=("manipnet:x", "recordings:y"), **said))
+    assert told == {"manipnet:x": 2 * [unnamed], "recordings:y": 2 * [unnamed | said]}
+    told.clear()
+    takes = {"train": ("a",), "validation": ("b",)}
+    training_data.collect(replace(CONFIG, data=("simulated", "recordings:y@3"), **takes, **said))
+    expected = [unnamed | said | {"takes": named} for named in takes.values()]
+    assert told == {"recordings:y@3": expected}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"data": ("simulated",), "train": ("a",)}, "one data set, found simulated"),
+        ({"data": ("simulated",), "validation": ("a",)}, "one data set, found simulated"),
+        ({"data": ("sig18:x", "recordings:y", "simulated"), "train": ("a",)}, "found sig18, reco"),
+        ({"data": ("simulated",), "unit": 7.0}, "are for recordings, found simulated"),
+        ({"data": ("simulated",), "left_handed": True}, "are for recordings, found simulated"),
+        ({"data": ("manipnet:x",), "unit": 7.0}, "are for recordings, found manipnet"),
+        ({"data": ("manipnet:x", "sig18:y"), "unit": 7.0}, "recordings, found manipnet, sig18"),
+        ({"data": (), "unit": 7.0}, "are for recordings, found none"),
+    ],
+)
+def test_what_is_said_of_data_that_are_not_there_is_refused(
+    wrong: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(CONFIG, **wrong)
+
+
+@pytest.mark.parametrize("split", ["training", "validation"])
+@pytest.mark.parametrize("apart", [False, True], ids=["of the data", "of their own"])
+def test_joint_truth_without_complete_frames_is_refused_before_anything_is_trained(
+    split: str, apart: bool
+) -> None:
+    trained: list[Any] = []
+    least = {"training": CONFIG.batch, "validation": 1}
+
+    def fit(complete: int) -> Any:
+        one_missing = np.where(
+            np.eye(len(HAND), dtype=bool)[np.arange(len(TRAINING.markers)) % len(HAND)][..., None],
+            np.nan,
+            TRAINING.markers,
+        )
+        one_missing[:complete] = TRAINING.markers[:complete]
+        frames = {"training": TRAINING, "validation": VALIDATION}
+        frames[split] = TRAINING._replace(markers=one_missing)
+        joint_frames = tuple(frames.values()) if apart else None
+        main = (TRAINING, VALIDATION) if apart else tuple(frames.values())
+        config = replace(CONFIG, epochs=1)
+        return fit_networks(*main, HAND, config, trained.append, joint_frames=joint_frames)
+
+    for complete in {0, least[split] - 1}:
+        message = rf"{split}.* {least[split]} or more .*all markers and angles.* found {complete}"
+        with pytest.raises(ValueError, match=message):
+            fit(complete)
+    assert not trained
+    assert fit(least[split]).joint_network
+
+
+def test_misshapen_joint_frames_are_refused() -> None:
+    for wrong, message in (
+        (VALIDATION._replace(markers=VALIDATION.markers[:, :8]), r"markers \[N, 9, 3\], found"),
+        (VALIDATION._replace(angles=VALIDATION.angles[:, :25]), r"angles \[320, 26\], found"),
+        (VALIDATION._replace(angles=VALIDATION.angles[:300]), r"angles \[320, 26\], found"),
+        (VALIDATION._replace(angles=None), r"angles \[N, 26\], found none"),
+    ):
+        with pytest.raises(ValueError, match=f"validation of the joint network: .*{message}"):
+            fit_networks(TRAINING, VALIDATION, HAND, CONFIG, joint_frames=(TRAINING, wrong))
 
 
 def test_a_frame_with_too_little_to_see_is_left_out() -> None:
