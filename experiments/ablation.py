@@ -26,13 +26,12 @@ from rich.console import Console
 
 from jaxhand import datasets, evaluation, simulation
 from jaxhand.anthropometry import People, mean_person
-from jaxhand.contact import HIGH, LOW
 from jaxhand.occlusions import OcclusionsConfig, occlusions
 from jaxhand.sequences import Dataset
 from jaxhand.tasks import Frames
 from jaxhand.training import Metrics, TrainingConfig, fit_networks
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, Hand, load_hand
+from numpy_infer.hand import ANGLES, HIGH, LOW, Hand, load_hand
 from numpy_infer.model import Model
 
 HAND = load_hand("glove9")

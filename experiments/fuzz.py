@@ -24,7 +24,7 @@ from fuzz_files import damaged_models, damaged_readers, steered_readers
 
 from numpy_infer import continuity, tracker
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, Hand
+from numpy_infer.hand import ANGLES, HIGH, LOW, Hand
 from numpy_infer.model import Model, load
 from numpy_infer.pose import HandPose
 from numpy_infer.predictors import PREDICTORS
@@ -84,14 +84,13 @@ KINDS: dict[str, Callable[[np.random.Generator, Array], Array]] = {
 
 def motion(rng: np.random.Generator, hand: Hand, frames: int, hands: int) -> Array:
     """`[T, H, M, 3]` metres: hands that bend, spread and are carried about."""
-    low, high = np.radians([angle.range_deg for angle in ANGLES]).T
     clock = np.arange(frames)[:, None, None] / 60
 
     def waves(width: int, speed: float) -> Array:
         pace, phase = rng.uniform(0, speed, (2, hands, width))
         return np.sin(pace * clock + 2 * np.pi * phase / speed)
 
-    angles = (low + high) / 2 + waves(len(ANGLES), 6) * (high - low) / 2
+    angles = (LOW + HIGH) / 2 + waves(len(ANGLES), 6) * (HIGH - LOW) / 2
     turn = rotations_from_angles(np.pi * waves(len(ANGLES), 2))[..., 0, :, :]
     points = forward_kinematics(
         hand.skeleton, rotations_from_angles(angles), turn, 0.5 * waves(3, 3)

@@ -21,7 +21,17 @@ from jaxhand.motion import DIP_SHARE
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import rotation_from_vector
-from numpy_infer.hand import ANGLES, CHAINS, FINGERS, POINTS, Hand
+from numpy_infer.hand import (
+    ANGLES,
+    CHAINS,
+    FINGER_OF_ANGLE,
+    FINGER_OF_POINT,
+    HIGH,
+    LOW,
+    POINTS,
+    SLOT_OF_ANGLE,
+    Hand,
+)
 
 CHUNK = 240
 """Frames differentiated in one call: a fixed number, so that one compilation serves all."""
@@ -70,18 +80,11 @@ TURN, SHIFT = slice(len(ANGLES), len(ANGLES) + 3), slice(len(ANGLES) + 3, len(AN
 """Of a frame's unknowns, after its angles: turn about the world's axes, and shift of the wrist."""
 _JOINTS, _FRAME = slice(len(ANGLES)), SHIFT.stop
 
-FINGER = np.array([FINGERS.index(angle.joint.split("_")[0]) for angle in ANGLES])
-SLOT = np.array([(FINGER[:i] == finger).sum() for i, finger in enumerate(FINGER)])
-"""`[26]` the finger of each angle, and its number there."""
-FINGER_OF = np.array([-1, *(i // 3 for i in range(15)), *range(5)])
-"""`[21]` the finger of each point; −1 for the wrist."""
 
 _BASES = np.array(CHAINS)[:, 0]
 _BONES = np.array([i for i in range(1, len(POINTS)) if i not in _BASES])
 WIDTHS = np.array([1, len(_BONES), 3 * len(_BASES)])
 """How many unknowns of a skeleton are the hand's size, bones' lengths, places of fingers' bases."""
-LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
-"""`[26]` radians each: the ends of the angles' ranges."""
 
 
 class Priors(NamedTuple):
@@ -361,9 +364,9 @@ def _differentiated(problem: Problem, state: State) -> tuple[Array, Array, Array
         np.concatenate(of, dtype=np.float64)[: len(state.angles)] for of in zip(*found, strict=True)
     )
     carrier = zip(hand.joints, hand.links, strict=True)
-    moves = FINGER_OF[[joint or link for joint, link in carrier]][:, None] == FINGER
+    moves = FINGER_OF_POINT[[joint or link for joint, link in carrier]][:, None] == FINGER_OF_ANGLE
     by_frame = np.empty((*places.shape, _FRAME))
-    by_frame[..., _JOINTS] = by_slot[..., SLOT] * moves[:, None]
+    by_frame[..., _JOINTS] = by_slot[..., SLOT_OF_ANGLE] * moves[:, None]
     by_frame[..., TURN] = -cross_matrix(places)
     by_frame[..., SHIFT] = np.eye(3)
     by_offsets = links[..., None, :] * np.eye(len(hand))[:, None, :, None]
@@ -387,12 +390,12 @@ def _derivatives(layout: Any, flat: Array, bones: Array, offsets: Array, frames:
         angles, rotation = of
 
         def placed(points: Array, slots: Array) -> tuple[Array, Array]:
-            turns = rotations_from_angles(angles + slots[SLOT])
+            turns = rotations_from_angles(angles + slots[SLOT_OF_ANGLE])
             at, turns = forward_kinematics(points, turns, rotation, jnp.zeros(3, angles.dtype))
             turned = turns[links]
             return at[joints] + product(turned, offsets[..., None])[..., 0], turned
 
-        none = jnp.zeros(SLOT.max() + 1, angles.dtype)
+        none = jnp.zeros(SLOT_OF_ANGLE.max() + 1, angles.dtype)
 
         def along(tangent: Array) -> Array:
             return jax.jvp(lambda points: placed(points, none)[0], (still,), (tangent,))[1]

@@ -20,7 +20,15 @@ from jaxhand.motion import DIP_SHARE
 from numpy_infer import geometry
 from numpy_infer import skeleton as runtime
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, CHAINS, FINGERS, Hand
+from numpy_infer.hand import (
+    ANGLES,
+    CHAINS,
+    FINGER_OF_ANGLE,
+    FINGER_OF_POINT,
+    FINGERS,
+    SLOT_OF_ANGLE,
+    Hand,
+)
 from numpy_infer.pose import DETERMINED_EXTENT
 
 __all__ = ["Calibration", "Priors", "Unknowns", "calibrate", "new_hand"]
@@ -242,7 +250,7 @@ def _postures(problem: Problem, state: State) -> Array:
     local = geometry.untransform(state.rotation, state.position, problem.markers)
     angles = state.angles.copy()
     for finger in range(len(FINGERS)):
-        mine = finger == arrow.FINGER
+        mine = finger == FINGER_OF_ANGLE
         tried: list[tuple[int, ...]] = [(-15, 15, 45, 80), (-15, 0, 15), (0,), (5, 40, 75, 105)]
         if finger == 0:
             tried = [(-20, 15, 45), (-25, 5, 35), (0,), (-5, 35), (0,), (0, 50)]
@@ -256,7 +264,7 @@ def _postures(problem: Problem, state: State) -> Array:
         places = runtime.marker_positions(hand, *points)
         unusual = ((postures @ arrow.MIX.T - arrow.MEAN) / arrow.DEVIATION) ** 2
         cost = np.repeat(UNUSUAL * unusual[None, :, mine].sum(-1), len(local), 0)
-        for marker in np.flatnonzero(arrow.FINGER_OF[list(hand.joints)] == finger):
+        for marker in np.flatnonzero(FINGER_OF_POINT[list(hand.joints)] == finger):
             square = ((local[:, None, marker] - places[:, marker]) ** 2).sum(-1)
             # Without a marker, and with a ghost, all postures are equal.
             cost += np.nan_to_num(np.minimum(square, NEAR[1] ** 2))
@@ -402,7 +410,7 @@ def _seen(
         by_place = np.concatenate([by_bones[way].sum(0), by_offset.reshape(3, -1)], -1)
         reach = (fitted.template[last] - fitted.skeleton[base]) @ by_place
         known = reach @ every @ reach < NARROWED**2 * (reach**2 @ prior)
-        flexions = (finger == arrow.FINGER) & np.isin(arrow.SLOT, FLEXIONS)
+        flexions = (finger == FINGER_OF_ANGLE) & np.isin(SLOT_OF_ANGLE, FLEXIONS)
         few, most = np.quantile(angles[np.ix_(shown, flexions)], [0.05, 0.95], axis=0)
         seen[finger] = known and (most - few > MOVED).all()
     return seen

@@ -20,7 +20,19 @@ import numpy as np
 from jaxhand.anthropometry import People
 from jaxhand.compiled import apart
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, PARENTS, POINTS, Hand
+from numpy_infer.hand import (
+    ANGLES,
+    ANGLES_OF_FINGER,
+    CHAINS,
+    FINGER_OF_ANGLE,
+    HIGH,
+    JOINTS,
+    LOW,
+    PARENTS,
+    POINTS,
+    SLOT_OF_ANGLE,
+    Hand,
+)
 from numpy_infer.skeleton import EULER, JOINT_AXES, SIGNS
 
 BONES = POINTS[1:]
@@ -42,18 +54,12 @@ EASE = np.radians(
 CHUNK = 256
 """Postures that are settled at once: what stays in a cache."""
 
-LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).astype(np.float32).T
-OF_FINGER = [[i for i, a in enumerate(ANGLES) if a.joint.startswith(f)] for f in FINGERS]
-FINGER_OF_ANGLE = np.repeat(np.arange(len(FINGERS)), [len(own) for own in OF_FINGER])
-"""`[26]` the finger that each angle moves."""
-
 _START, _END = np.array(PARENTS[1:]), np.arange(1, len(POINTS))
 _CHAINS = np.array(CHAINS)
 _LAST, _TIP = _CHAINS[:, 2], _CHAINS[:, 3]
-_SLOT = np.concatenate([np.arange(len(own)) for own in OF_FINGER])
-_ANGLE = np.array([(own + own[:1])[:6] for own in OF_FINGER])
+_ANGLE = np.array([(own + own[:1])[:6] for own in ANGLES_OF_FINGER])
 """`[5, 6]` the angles of each finger; a finger's sixth is none, see `_USED`."""
-_USED = np.array([[k < len(own) for k in range(6)] for own in OF_FINGER], np.float32)
+_USED = np.array([[k < len(own) for k in range(6)] for own in ANGLES_OF_FINGER], np.float32)
 _JOINT, _AXIS = EULER
 _AXES = np.moveaxis(JOINT_AXES, 0, -1).astype(np.float32)[..., None]
 """`[3, 3, 15, 1]` the joints' own axes in the flat hand, as columns."""
@@ -311,7 +317,7 @@ def _touch_step(
     one, two, three = square[0], square[1], square[2]
     crosses = [jnp.stack(_cross(*pair)) for pair in ((two, three), (three, one), (one, two))]
     pull = jnp.stack([_dot(gap, crossed) for crossed in crosses]) / _dot(one, crosses[0])
-    return STEP * _dot(slopes, pull[:, :, None])[FINGER_OF_ANGLE, _SLOT]
+    return STEP * _dot(slopes, pull[:, :, None])[FINGER_OF_ANGLE, SLOT_OF_ANGLE]
 
 
 def generalised(points: Array, axes: Array, force: Array) -> Array:

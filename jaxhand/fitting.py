@@ -18,7 +18,19 @@ import numpy as np
 from jaxhand.geometry import product, solve
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, PARENTS, POINTS
+from numpy_infer.hand import (
+    ANGLES,
+    ANGLES_OF_FINGER,
+    CHAINS,
+    FINGER_OF_ANGLE,
+    FINGERS,
+    HIGH,
+    JOINTS,
+    LOW,
+    PARENTS,
+    POINTS,
+    SLOT_OF_ANGLE,
+)
 from numpy_infer.skeleton import JOINT_AXES
 
 ITERATIONS = 100
@@ -40,16 +52,13 @@ tip lies aside, which hinges cannot express, from being twisted by 70°."""
 REST_EVERY, REST_ROUNDS = 10, 2
 """Every how many-th frame the bones' rest directions are taken from, and rounds of it."""
 
-_OF_FINGER = [[i for i, a in enumerate(ANGLES) if a.joint.startswith(f)] for f in FINGERS]
-_WIDTH = max(map(len, _OF_FINGER))
-_ANGLE = np.array([(own + [len(ANGLES)] * _WIDTH)[:_WIDTH] for own in _OF_FINGER])
+_WIDTH = max(map(len, ANGLES_OF_FINGER))
+_ANGLE = np.array([(own + [len(ANGLES)] * _WIDTH)[:_WIDTH] for own in ANGLES_OF_FINGER])
 """`[5, 6]` the angle at each finger's slot; 26 stands for a slot that the finger does not use."""
-_FINGER, _SLOT = np.array([np.argwhere(i == _ANGLE)[0] for i in range(len(ANGLES))]).T
-"""`[26]` the finger of each angle, and its slot there."""
 _POINT = np.array(CHAINS)[:, 1:]
 """`[5, 3]` the points of each finger that its angles move."""
 
-_LOW, _HIGH = np.radians([a.range_deg for a in ANGLES]).astype(np.float32).T
+_LOW, _HIGH = np.float32(LOW), np.float32(HIGH)
 _TWIST = np.array([a.name.endswith("_twist") for a in ANGLES], np.float32)
 
 
@@ -134,7 +143,7 @@ def angle_deviation(skeleton: Array, angles: Array) -> Array:
     with jax.default_device(jax.local_devices(backend="cpu")[0]):
         matrices = np.asarray(_information(np.float32(skeleton), np.float32(angles)), np.float64)
     variance = np.diagonal(np.linalg.inv(matrices), axis1=-2, axis2=-1)
-    return np.sqrt(variance.mean(0)[_FINGER, _SLOT])
+    return np.sqrt(variance.mean(0)[FINGER_OF_ANGLE, SLOT_OF_ANGLE])
 
 
 class _State(NamedTuple):
@@ -168,11 +177,11 @@ def _fit_frame(skeleton: Array, points: Array, weight: Array) -> FitResult:
         gradient = (rows * residuals(state.angles)[:, None]).sum(-1)
         matrix = product(rows, jnp.swapaxes(rows, -1, -2))
         move = solve(matrix + state.damping[:, None, None] * jnp.eye(_WIDTH), gradient)
-        angles = state.angles - move[_FINGER, _SLOT]
+        angles = state.angles - move[FINGER_OF_ANGLE, SLOT_OF_ANGLE]
         cost = (residuals(angles) ** 2).sum(-1)
         better = cost < state.cost
         return _State(
-            jnp.where(better[_FINGER], angles, state.angles),
+            jnp.where(better[FINGER_OF_ANGLE], angles, state.angles),
             jnp.where(better, cost, state.cost),
             jnp.clip(state.damping * jnp.where(better, 0.1, 10), 1e-6, 1e8),
             state.steps + 1,
@@ -202,7 +211,7 @@ def _start(points: Array) -> Array:
         about = {"x": jnp.arctan2(y, -z), "y": jnp.arctan2(-x, jnp.hypot(y, z))}
         for i, angle in enumerate(ANGLES):
             if JOINTS.index(angle.joint) in joints and angle.axis in about:
-                angles = angles.at[i].set(angle.sign * about[angle.axis][_FINGER[i]])
+                angles = angles.at[i].set(angle.sign * about[angle.axis][FINGER_OF_ANGLE[i]])
     return angles
 
 
@@ -245,6 +254,6 @@ def _jacobian(residuals: Callable[[Array], Array], angles: Array) -> Array:
     """`[5, 6, N]` derivative of each finger's N residuals by each of its 6 slots."""
 
     def moved(slots: Array) -> Array:
-        return residuals(angles + slots[_SLOT])
+        return residuals(angles + slots[SLOT_OF_ANGLE])
 
     return jnp.swapaxes(jax.jacfwd(moved)(jnp.zeros(_WIDTH, angles.dtype)), -1, -2)

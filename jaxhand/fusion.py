@@ -19,14 +19,23 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxhand.networks  # noqa: F401  makes `Hand` an argument that jit understands
-from jaxhand.arrow import FINGER, SLOT
 from jaxhand.geometry import kabsch, product, second_extent, transform, untransform
 from jaxhand.ik import in_hand_frame
 from jaxhand.skeleton import align_fingers, angles_from_rotations, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import kabsch as numpy_kabsch
 from numpy_infer.geometry import mirror, mirror_rotation, nearest_rotation, shortest_arc
-from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, PARENTS, Hand, flat_points
+from numpy_infer.hand import (
+    ANGLES,
+    CHAINS,
+    FINGER_OF_ANGLE,
+    FINGERS,
+    JOINTS,
+    PARENTS,
+    SLOT_OF_ANGLE,
+    Hand,
+    flat_points,
+)
 from numpy_infer.pose import DETERMINED_EXTENT
 from numpy_infer.recordings import Recording
 
@@ -57,9 +66,9 @@ AUTHORS_JOINTS = {
 }
 """The joints of the paper authors' files → ours."""
 
-_WIDTH = int(SLOT.max()) + 1
+_WIDTH = int(SLOT_OF_ANGLE.max()) + 1
 _ANGLE = np.full((len(FINGERS), _WIDTH), len(ANGLES))
-_ANGLE[FINGER, SLOT] = np.arange(len(ANGLES))
+_ANGLE[FINGER_OF_ANGLE, SLOT_OF_ANGLE] = np.arange(len(ANGLES))
 """`[5, 6]` the angle at each finger's slot; 26 stands for a slot that the finger does not use."""
 _BASES = np.array(CHAINS)[:, 0]
 _PARENTS = np.array(PARENTS)[1 : len(JOINTS)]
@@ -282,7 +291,7 @@ def _fuse(hand: Hand, imu: Array, markers: Array, seen: Array, dt: Array) -> Fus
         felt, rest, markers, seen, dt, slew, determined, rotation, position = now
 
         def modelled(correction: Array) -> Array:
-            angles = felt + correction[FINGER, SLOT]
+            angles = felt + correction[FINGER_OF_ANGLE, SLOT_OF_ANGLE]
             return in_hand_frame(hand, product(rotations_from_angles(angles), rest))[0]
 
         def helped_out() -> tuple[Array, Array]:
@@ -322,7 +331,7 @@ def _fuse(hand: Hand, imu: Array, markers: Array, seen: Array, dt: Array) -> Fus
     slew = (SLEW * dt).at[0].set(jnp.inf)
     frames = (felt, rest, markers, seen, dt, slew, determined, rotations, positions)
     _, (correction, rotation, position) = jax.lax.scan(frame, start, frames)
-    angles = felt + correction[:, FINGER, SLOT]
+    angles = felt + correction[:, FINGER_OF_ANGLE, SLOT_OF_ANGLE]
     fused = product(rotations_from_angles(angles), rest)
     return _result(hand, fused, rotation, position, markers, seen)
 

@@ -16,12 +16,13 @@ from jaxhand.hand_size import Size, hand_size
 from jaxhand.joint_evaluation import evaluate_poses
 from numpy_infer import wearer
 from numpy_infer.arrays import Array
+from numpy_infer.cli import check_output
 from numpy_infer.geometry import mirror
 from numpy_infer.hand import FINGERS, POINTS, Hand, load_hand
 from numpy_infer.model import Model
 from numpy_infer.model import load as load_model
 from numpy_infer.recordings import Recording, load_label_map, read
-from numpy_infer.wearer import Wearer
+from numpy_infer.wearer import Wearer, worn_by
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,13 +69,13 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
     A glove of many markers gives every bone, one of few the hand's size.
 
     Raises:
-        ValueError: a file that is none or exists already, or a recording that does not determine a
-            hand.
+        ValueError: a file that is none, exists already or would stand in no folder, or a recording
+            that does not determine a hand.
     """
     console = console or Console(soft_wrap=True, highlight=False)
     recording, model = _read(config), load_model(config.model)
     markers = _markers(recording, model.hand.markers, config.right)
-    flat = None if config.flat is None else _flat(model, recording, markers, config.flat)
+    held = None if config.flat is None else _held(model, recording, markers, config.flat)
     with console.status("fitting the hand"):
         if len(model.hand) >= DENSE:
             found = calibrate(model.hand, markers, rate=recording.rate)
@@ -83,6 +84,7 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
             size = hand_size(model, markers)
             hand, seen, said = model.hand.resized(size.factor), size.seen, _of_size(size)
     unseen = tuple(finger for finger, known in zip(FINGERS, seen, strict=True) if not known)
+    flat = None if held is None else _flat(worn_by(model, hand), markers[held])
     person = Wearer(hand, flat, unseen)
     wearer.save(person, config.out, overwrite=config.overwrite)
     for line in said:
@@ -122,8 +124,7 @@ def describe_glove(config: HandConfig, console: Console | None = None) -> None:
 
 
 def _read(config: _File) -> Recording:
-    if config.out.exists() and not config.overwrite:
-        raise ValueError(f"{config.out} exists: choose another name, or pass --overwrite")
+    check_output(config.out, overwrite=config.overwrite)
     return read(
         config.recording,
         unit=config.unit,
@@ -138,20 +139,27 @@ def _markers(recording: Recording, names: tuple[str, ...], right: bool) -> Array
     return mirror(markers) if right else markers
 
 
-def _flat(
+def _held(
     model: Model, recording: Recording, markers: Array, seconds: tuple[float, float]
 ) -> Array:
-    """`[26]` radians: what the joint network says of the hand that is held flat meanwhile."""
+    """`[T]` True in the frames in which a flat hand is held, with all its markers."""
     if model.joint_network is None:
         raise ValueError("--flat: the model has no joint network to calibrate")
     since = recording.time - recording.time[0]
-    held = (since >= seconds[0]) & (since <= seconds[1]) & np.isfinite(markers).all((-1, -2))
+    held: Array = (since >= seconds[0]) & (since <= seconds[1])
+    held &= np.isfinite(markers).all((-1, -2))
     if not held.any():
         raise ValueError(
             f"--flat: no frame with all markers from {seconds[0]:g} to {seconds[1]:g} s; the "
             f"recording lasts {since[-1]:.1f} s"
         )
-    poses = evaluate_poses(replace(model, alignment=False), markers[held].astype(np.float32))
+    return held
+
+
+def _flat(model: Model, markers: Array) -> Array:
+    """`[26]` radians: what the joint network says of a flat hand `[N, M, 3]`, in metres. The model
+    is the one that will run, on the person's own bones."""
+    poses = evaluate_poses(replace(model, alignment=False), markers.astype(np.float32))
     angles: Array = poses.angles
     return angles.mean(0)
 

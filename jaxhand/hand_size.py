@@ -13,11 +13,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxhand.arrow import FINGER, SLOT
 from jaxhand.calibration import FLEXIONS, MOVED
 from jaxhand.joint_evaluation import evaluate_poses
 from numpy_infer.arrays import Array
-from numpy_infer.hand import FINGERS
+from numpy_infer.hand import FINGER_OF_ANGLE, FINGERS, SLOT_OF_ANGLE
 from numpy_infer.model import Model
 from numpy_infer.skeleton import marker_positions
 
@@ -109,5 +108,5 @@ def _lowest(cost: Array) -> float:
 
 def _seen(angles: Array) -> Array:
     few, most = np.quantile(angles, [0.05, 0.95], axis=0)
-    moved = (most - few > MOVED) | ~np.isin(SLOT, FLEXIONS)
-    return np.array([moved[finger == FINGER].all() for finger in range(len(FINGERS))])
+    moved = (most - few > MOVED) | ~np.isin(SLOT_OF_ANGLE, FLEXIONS)
+    return np.array([moved[finger == FINGER_OF_ANGLE].all() for finger in range(len(FINGERS))])

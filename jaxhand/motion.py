@@ -19,9 +19,17 @@ import numpy as np
 
 from jaxhand.anthropometry import People, mean_person
 from jaxhand.compiled import apart
-from jaxhand.contact import FINGER_OF_ANGLE, HIGH, LOW, OF_FINGER, depth, first_clear, settled
+from jaxhand.contact import depth, first_clear, settled
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, FINGERS, load_hand
+from numpy_infer.hand import (
+    ANGLES,
+    ANGLES_OF_FINGER,
+    FINGER_OF_ANGLE,
+    FINGERS,
+    HIGH,
+    LOW,
+    load_hand,
+)
 
 DIP_SHARE, DIP_SPREAD = 2 / 3, 0.25
 """Of a PIP joint's flexion that its DIP joint takes on, one tendon bends both, and how much that
@@ -236,7 +244,7 @@ def angles_of(kind: Array, normal: Array) -> Array:
     thumb = of["thumb"] + easy * thumb
     angles = jnp.concatenate([thumb, fingers.reshape(*mcp.shape[:-1], -1)], -1)
     angles = angles + jnp.asarray(FLAT_SPREAD) * flat[..., 1:]
-    return jnp.clip(angles, jnp.asarray(LOW), jnp.asarray(HIGH))
+    return jnp.clip(angles, jnp.float32(LOW), jnp.float32(HIGH))
 
 
 def motion(
@@ -272,7 +280,7 @@ def motion(
     place, turn = wander(wandering, time)
     shake, drift, sway = shaking(shakes, time)
     return Motion(
-        angles=jnp.clip(angles + shake, jnp.asarray(LOW), jnp.asarray(HIGH)),
+        angles=jnp.clip(angles + shake, jnp.float32(LOW), jnp.float32(HIGH)),
         wrist_rotation=from_pitch_yaw_roll(turn + sway),
         wrist_position=jnp.array(HOME) + place + drift,
     )
@@ -379,8 +387,8 @@ def wander(draws: Array, time: Array) -> tuple[Array, Array]:
 
 
 _SHAKEN = np.zeros((len(ANGLES),), np.float32)
-_SHAKEN[[OF_FINGER[f][0] for f in range(5)]] = 1
-_SHAKEN[[OF_FINGER[f][3] for f in range(5)]] = 0.5
+_SHAKEN[[ANGLES_OF_FINGER[f][0] for f in range(5)]] = 1
+_SHAKEN[[ANGLES_OF_FINGER[f][3] for f in range(5)]] = 0.5
 """`[26]` how much of a finger's tremor each angle takes: its first and its middle flexion."""
 
 

@@ -23,6 +23,7 @@ from jaxhand.cameras import Rig, film
 from jaxhand.compiled import compiled
 from jaxhand.two_hands import two_hands
 from numpy_infer.arrays import Array
+from numpy_infer.cli import check_output
 from numpy_infer.hand import Hand, bundled, load_hand
 from numpy_infer.recordings import Recording, load_label_map, read
 
@@ -309,12 +310,13 @@ def occlusions(config: OcclusionsConfig, console: Console | None = None) -> dict
         Tables by name: `"one hand"` of the recordings with one, `"two hands"` of those with two.
 
     Raises:
-        ValueError: a file that is none or exists already, or labels that fit no hand.
+        ValueError: a file that is none, exists already or would stand in no folder, or labels that
+            fit no hand.
     """
     console = console or Console(soft_wrap=True, highlight=False)
     for path in (config.json, config.picture):
-        if path is not None and path.exists() and not config.overwrite:
-            raise ValueError(f"{path} exists: choose another name, or pass --overwrite")
+        if path is not None:
+            check_output(path, overwrite=config.overwrite)
     if not config.files:
         raise ValueError(f"expected marker files, or the word {SIMULATED}")
     tables = _simulated(config) if config.files == (SIMULATED,) else _recorded(config, console)

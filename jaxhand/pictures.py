@@ -27,6 +27,7 @@ METHODS = {
     "ik_tuned": ("inverse kinematics, fine-tuned", "#e69f00", "D"),
     "least_squares": ("least squares", "#cc79a7", "v"),
     "learned_uncalibrated": ("learned, bones of others", "#56b4e9", "^"),
+    "learned_unaligned": ("learned, not aligned", "#d55e00", "X"),
     "learned_paper": ("learned, plain recipe", "#009e73", "P"),
 }
 """Name, colour and sign of each method. The colours stay apart for the colour-blind (Okabe & Ito

@@ -15,10 +15,12 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from jaxhand import joint_evaluation
-from jaxhand.datasets import Dataset, load
+from jaxhand.datasets import load
 from jaxhand.evaluation import COUNTS, DURATIONS, SEEDS, Report, mean_ratio, methods, table3
 from jaxhand.joint_evaluation import joint_errors
 from jaxhand.options import AlsoModels, DataSets, Takes
+from jaxhand.sequences import Dataset
+from numpy_infer.cli import check_output
 from numpy_infer.model import Model, bundled
 from numpy_infer.model import load as load_model
 from numpy_infer.predictors import BASELINES
@@ -67,14 +69,15 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
         "joints": {METHOD: {"cm", "deg", "wrist_mm", "wrist_deg": CELL}}}`, see `evaluation`.
 
     Raises:
-        ValueError: no model for the hand, a file that is none or that exists already, no data.
+        ValueError: no model for the hand, a file that is none, that exists already or would stand
+            in no folder, no data.
     """
     console = console or Console()
     if config.seeds < 1:
         raise ValueError(f"seeds: expected 1 or more, found {config.seeds}")
     for path in (config.json, config.plot):
-        if path is not None and path.exists() and not config.overwrite:
-            raise ValueError(f"{path} exists: choose another name, or pass --overwrite")
+        if path is not None:
+            check_output(path, overwrite=config.overwrite)
     if len(config.data) != 1:
         raise ValueError(f"expected one --data, found {len(config.data)}: each gets its own table")
     named = config.model is not None and config.model not in BASELINES
@@ -180,7 +183,8 @@ def _named(text: str) -> tuple[str, str]:
 
 
 def print_table4(table: Mapping[str, Any], console: Console) -> None:
-    """Table 4: error in cm, with half of its 95 % interval."""
+    """Table 4: error in cm, with half of its 95 % interval. What a method was not measured with
+    takes no lines."""
     printed = Table(
         title="Error of the joints with k markers hidden, cm (paper, Table 4)",
         box=SIMPLE_HEAD,
@@ -191,10 +195,11 @@ def print_table4(table: Mapping[str, Any], console: Console) -> None:
         justify: Any = "left" if heading == "method" else "right"
         printed.add_column(heading, justify=justify, no_wrap=True)
     for name, rows in table.items():
-        printed.add_row(name, "0", _cell(rows["0"]))
-        for count in COUNTS:
+        counts = [k for k in COUNTS if any(cell["n"] for cell in rows[str(k)].values())]
+        printed.add_row(name, "0", _cell(rows["0"]), end_section=not counts)
+        for count in counts:
             cells = [_cell(rows[str(count)][f"{duration:.1f}"]) for duration in DURATIONS]
-            printed.add_row("", str(count), *cells, end_section=count == COUNTS[-1])
+            printed.add_row("", str(count), *cells, end_section=count == counts[-1])
     console.print(printed)
 
 

@@ -21,7 +21,7 @@ from jaxhand.contact import marked
 from jaxhand.motion import DIP_SHARE, minimum_jerk, motion, uniform
 from jaxhand.sequences import RATE, Sequence
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, Hand
+from numpy_infer.hand import ANGLES, HIGH, LOW, Hand
 
 GAPS = Spells(1 / 3, 0.1, 0.6)
 """Of each marker by itself. 90 % are shorter than 0.37 s (paper, section 6.1: 0.36 s), one in fifty
@@ -57,7 +57,6 @@ POSE_KINDS = (
 NEIGHBOUR_CORRELATION = 0.8
 """Of the flexions of neighbouring fingers, beside what their kind of posture has in common."""
 
-_LOW, _HIGH = np.radians([angle.range_deg for angle in ANGLES]).astype(np.float32).T
 _DISTANCE = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
 _NEIGHBOURS = np.linalg.cholesky(NEIGHBOUR_CORRELATION**_DISTANCE).astype(np.float32)
 """`[4, 4]` makes independent numbers of four fingers correlated ones."""
@@ -125,7 +124,7 @@ def poses(key: Array, batch: tuple[int, ...] = ()) -> Array:
     twist = math.radians(3) * own[4]
     fingers = jnp.stack([mcp, abduction, twist, pip, dip], -1)
     angles = jnp.concatenate([thumb, fingers.reshape(*batch, -1)], -1)
-    return jnp.clip(angles, jnp.asarray(_LOW), jnp.asarray(_HIGH))
+    return jnp.clip(angles, jnp.float32(LOW), jnp.float32(HIGH))
 
 
 def gaps(key: Array, frames: int, markers: int, rate: float, batch: tuple[int, ...] = ()) -> Array:

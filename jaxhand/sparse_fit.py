@@ -13,12 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhand.arrow import FINGER, HIGH, LOW, SLOT
 from jaxhand.geometry import cross, kabsch, product, transform, untransform
 from jaxhand.ik import Solved, flat_frames, in_hand_frame, shaped, solved_from
 from jaxhand.skeleton import rotations_from_angles
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, Hand
+from numpy_infer.hand import ANGLES, FINGER_OF_ANGLE, HIGH, LOW, SLOT_OF_ANGLE, Hand
 
 NOISE = 1e-3
 """Metres per axis: what one standard deviation of a marker is."""
@@ -139,7 +138,9 @@ def _posture(
     `[M, 3]` of one frame, as seen from that start."""
     dtype, count = target.dtype, len(ANGLES)
     # A finger's angles move none of the others' markers, and no tangent tells the fingers apart.
-    own = np.array([[m in hand.finger_markers[f] for f in FINGER] for m in range(len(hand))])
+    own = np.array(
+        [[m in hand.finger_markers[f] for f in FINGER_OF_ANGLE] for m in range(len(hand))]
+    )
     low, high = (jnp.asarray(end).astype(dtype) for end in (LOW, HIGH))
     wrist_scale = jnp.asarray(np.repeat(WRIST_PRIOR, 3)).astype(dtype)
     scale = seen[:, None].astype(dtype) / NOISE
@@ -164,9 +165,9 @@ def _posture(
     def slopes(unknowns: Array) -> Array:
         """`[3 M + 26, 32]` derivative of the residuals, without the priors' own, which is 1."""
         angles, wrist = unpacked(unknowns)
-        by_slot = jax.jacfwd(lambda slots: placed(angles + slots[SLOT]))
-        by_slot = by_slot(jnp.zeros(SLOT.max() + 1, dtype))
-        by_angle = jnp.where(own[:, None], by_slot[..., SLOT], 0)
+        by_slot = jax.jacfwd(lambda slots: placed(angles + slots[SLOT_OF_ANGLE]))
+        by_slot = by_slot(jnp.zeros(SLOT_OF_ANGLE.max() + 1, dtype))
+        by_angle = jnp.where(own[:, None], by_slot[..., SLOT_OF_ANGLE], 0)
         by_angle = product(_small_turn(wrist[:3]), by_angle)
         by_wrist = jax.jacfwd(moved)(wrist, placed(angles)) * wrist_scale
         by_angle, by_wrist = (

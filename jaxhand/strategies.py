@@ -17,10 +17,9 @@ from hypothesis.extra import numpy as hnp
 
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import kabsch
-from numpy_infer.hand import ANGLES, POINTS, Hand, bundled, hand_from_json, load_hand
+from numpy_infer.hand import ANGLES, HIGH, LOW, POINTS, Hand, bundled, hand_from_json, load_hand
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
-LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
 """`[26]` radians each: the ranges of the joint angles."""
 
 DURATIONS = (1 / 60, 1 / 120, 0.1, 0.003, 0.0)

@@ -21,7 +21,7 @@ from jaxhand.networks import arrays_of, build, predict
 from jaxhand.occlusions import FEWEST_LEFT, Occlusions, draw
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, Hand
+from numpy_infer.hand import ANGLES, CHAINS, FINGER_OF_ANGLE, FINGER_OF_POINT, FINGERS, Hand
 from numpy_infer.networks import Dense, Network, Spec
 
 JOINT_POINTS = tuple(point for chain in CHAINS for point in chain[1:])
@@ -233,18 +233,13 @@ def mix_fingers(key: Array, hand: Hand, markers: Array, angles: Array) -> tuple[
         markers: `[N, M, 3]` metres, hand frame, where fingers do not depend on each other.
         angles: `[N, 26]` radians.
     """
-    finger_of_marker = np.array([FINGER_OF_JOINT[link] for link in hand.links])
-    finger_of_angle = np.array([FINGER_OF_JOINT[JOINTS.index(a.joint)] for a in ANGLES])
+    finger_of_marker = FINGER_OF_POINT[list(hand.links)]
     for finger in range(len(FINGERS)):
         order = jax.random.permutation(jax.random.fold_in(key, finger), len(markers))
         own = (finger_of_marker == finger)[:, None]
         markers = jnp.where(own, markers[order], markers)
-        angles = jnp.where(finger_of_angle == finger, angles[order], angles)
+        angles = jnp.where(finger == FINGER_OF_ANGLE, angles[order], angles)
     return markers, angles
-
-
-FINGER_OF_JOINT = (-1, *np.repeat(np.arange(len(FINGERS)), 3).tolist())
-"""For each joint of `hand.JOINTS` the index of its finger in `FINGERS`; −1 for the wrist."""
 
 
 @partial(jax.jit, static_argnames=("augmentation", "simulated", "hand"))

@@ -23,7 +23,7 @@ from jaxhand.compiled import apart
 from jaxhand.geometry import mirror, mirror_rotation, product
 from jaxhand.motion import KEYFRAMES, Motion
 from numpy_infer.arrays import Array
-from numpy_infer.hand import Hand, load_hand
+from numpy_infer.hand import FINGER_OF_ANGLE, HIGH, LOW, Hand, load_hand
 
 MOVE_SECONDS = (0.4, 1.6)
 """Shortest and longest move from stop to stop."""
@@ -147,7 +147,7 @@ def two_hands(
     stops, _ = scenes(draws.reshape(*batch, number, SCENE_DRAWS), people)
     rows = stops.reshape(*batch, -1, 2 * stops.shape[-1])
     plan = motion.schedule(timing, time, MOVE_SECONDS)
-    columns = np.tile([*motion.FINGER_OF_ANGLE, *[2] * 6], 2)
+    columns = np.tile([*FINGER_OF_ANGLE, *[2] * 6], 2)
     hands = apart(motion.between(rows, plan.move, plan.share[..., columns]))
     hands = hands.reshape(*batch, frames, 2, -1)
     place, turn = motion.wander(wandering, time)
@@ -156,8 +156,8 @@ def two_hands(
     common = apart(motion.from_pitch_yaw_roll(turn + sway[..., 0, :, :]))
     angles = jnp.clip(
         hands[..., :26] + jnp.moveaxis(shake, -3, -2),
-        jnp.asarray(motion.LOW),
-        jnp.asarray(motion.HIGH),
+        jnp.float32(LOW),
+        jnp.float32(HIGH),
     )
     own, at = apart(motion.from_pitch_yaw_roll(hands[..., 29:])), hands[..., 26:29]
     home = jnp.array(motion.HOME) + place + drift[..., 0, :, :]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -20,7 +21,7 @@ from numpy_infer.model import bundled as bundled_models
 from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import Notice, Status, TrackingState
 from numpy_infer.predictors import BASELINES, PREDICTORS
-from numpy_infer.recordings import Recording, load_label_map, read, write
+from numpy_infer.recordings import Recording, load_label_map, read, write, writer_of
 from numpy_infer.tracking import Tracked, prefixed, track, track_hands
 
 VERBS = {
@@ -35,7 +36,8 @@ VERBS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs one command; returns the exit status: 0, or 2 after one line on stderr."""
+    """Runs one command; returns the exit status: 0, 2 after one line on stderr, or 1 if whoever
+    reads what is printed has gone."""
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     if arguments and arguments[0] in VERBS:
         return _hand_over(arguments[0], arguments[1:])
@@ -43,11 +45,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         run: Callable[[argparse.Namespace], None] = options.run
         run(options)
+        sys.stdout.flush()
+    except BrokenPipeError:  # `| head` has read enough; Python would flush once more at the end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except (ValueError, OSError) as error:
         print(f"jaxhand {options.verb}: {error}", file=sys.stderr)
         return 2
-    except BrokenPipeError:  # `| head` has read enough
-        sys.stderr.close()
     except KeyboardInterrupt:
         print(f"\njaxhand {options.verb}: stopped; no file was changed", file=sys.stderr)
         return 130
@@ -142,6 +146,24 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
+def check_output(path: Path, *, overwrite: bool) -> None:
+    """Refuses, before the work, a file that could not be written after it.
+
+    Args:
+        path: the file to write.
+        overwrite: it may be there already.
+
+    Raises:
+        ValueError: it exists, it is a folder, or it would stand in none.
+    """
+    if not path.parent.is_dir():
+        raise ValueError(f"{path.parent} is no folder: make it first")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: choose another name")
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists: choose another name, or pass --overwrite")
+
+
 def _add_file(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("file", type=Path, help="TRC, Qualisys TSV, CSV, Motive CSV, BVH, C3D, …")
     verb.add_argument("--map", type=Path, help='JSON file {"label in the file": "marker"}')
@@ -217,13 +239,14 @@ def describe(recording: Recording) -> dict[str, Any]:
 def _track(options: argparse.Namespace) -> None:
     outputs = _outputs(options)
     for output in outputs.values():
-        if output.exists() and not options.overwrite:
-            raise ValueError(f"{output} exists: choose another name, or pass --overwrite")
+        writer_of(output)
+        check_output(output, overwrite=options.overwrite)
         if output.exists() and output.samefile(options.file):
             raise ValueError(f"{output} is the recording itself: choose another name")
     recording = _read(options)
-    prefixes = {"left": options.left_prefix, "right": options.right_prefix}
-    model = _model(options, recording, next((p for p in prefixes.values() if p), ""))
+    prefixes = {"left": options.left_prefix or "", "right": options.right_prefix or ""}
+    labels = [_labels(recording, prefixes[side]) for side in outputs]
+    model = _model(options, labels[0])
     if options.predictor:
         model = replace(model, predictor=options.predictor)
     if options.joints:
@@ -242,7 +265,7 @@ def _track(options: argparse.Namespace) -> None:
         if show:
             print(f"\rtracking {100 * share:3.0f} %", end="", file=sys.stderr, flush=True)
 
-    hands = [prefixed(recording, prefixes[side] or "", model.hand) for side in outputs]
+    hands = [prefixed(recording, prefixes[side], model.hand) for side in outputs]
     if len(hands) == 1:
         results = [track(hands[0], model, right="right" in outputs, report=report)]
     else:
@@ -292,29 +315,40 @@ def _summary(result: Tracked) -> str:
     return "\n".join(lines)
 
 
-def _model(options: argparse.Namespace, recording: Recording, prefix: str) -> Model:
-    labels = [n.removeprefix(prefix) for n in recording.names if n.startswith(prefix)]
+def _labels(recording: Recording, prefix: str) -> list[str]:
+    """Those that begin with the prefix, without it."""
+    labels = [name.removeprefix(prefix) for name in recording.names if name.startswith(prefix)]
+    if not labels:
+        raise ValueError(f"no label begins with {prefix!r}; there are {', '.join(recording.names)}")
+    return labels
+
+
+def _model(options: argparse.Namespace, labels: Sequence[str]) -> Model:
     if options.model in BASELINES:
-        return Model(_fitting_hand(options.hand, labels), predictor=options.model)
+        hand = _fitting_hand(labels, "--hand FILE") if not options.hand else load_hand(options.hand)
+        return Model(hand, predictor=options.model)
     if options.hand:
-        raise ValueError("--hand goes with a baseline; a model brings its own hand")
+        raise ValueError(
+            f"--hand goes with a baseline (--model {' or '.join(BASELINES)}); a model brings its "
+            "own hand"
+        )
     if options.model:
         return load(options.model)
-    name = _fitting_hand(None, labels).name
+    name = _fitting_hand(labels, "--model FILE, or a baseline: --model affine --hand FILE").name
     if name not in bundled_models():
         raise ValueError(f"no model is bundled for {name}: name one with --model")
     print(f"tracked by the bundled model {name}")
     return load(name)
 
 
-def _fitting_hand(name: str | None, labels: Sequence[str]) -> Hand:
-    if name:
-        return load_hand(name)
+def _fitting_hand(labels: Sequence[str], instead: str) -> Hand:
+    """The largest bundled hand that the labels have all markers of; `instead` are the options that
+    name what to take where there is none."""
     fits = [hand for hand in bundled() if set(load_hand(hand).markers) <= set(labels)]
     if not fits:
         raise ValueError(
-            f"no bundled hand fits the labels {', '.join(labels)}: name one with --hand, "
-            "and rename labels with --map"
+            f"no bundled hand fits the labels {', '.join(labels)}: rename them with --map, or "
+            f"pass {instead}"
         )
     return max(map(load_hand, fits), key=len)
 

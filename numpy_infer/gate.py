@@ -27,7 +27,7 @@ import numpy as np
 
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import kabsch, mean_point, second_extent, transform
-from numpy_infer.hand import ANGLES, JOINTS, PARENTS, Hand
+from numpy_infer.hand import ANGLES, HIGH, JOINTS, LOW, PARENTS, Hand
 from numpy_infer.model import Model
 from numpy_infer.output import leading
 from numpy_infer.pose import DETERMINED_EXTENT
@@ -129,8 +129,7 @@ class Reach(NamedTuple):
 @lru_cache(maxsize=16)
 def reach(hand: Hand) -> Reach:
     """The tables of a hand, from random postures within the ranges of its joints."""
-    low, high = np.radians([angle.range_deg for angle in ANGLES]).T
-    angles = np.random.default_rng(0).uniform(low, high, (POSTURES, len(ANGLES)))
+    angles = np.random.default_rng(0).uniform(LOW, HIGH, (POSTURES, len(ANGLES)))
     eye = np.broadcast_to(np.eye(3), (POSTURES, 3, 3))
     local = rotations_from_angles(angles)
     placed = forward_kinematics(hand.skeleton, local, eye, np.zeros((POSTURES, 3)))

@@ -88,6 +88,16 @@ positive towards the thumb (the thumb's own: palmar, away from the index). Range
 about clinical norms of active motion (AAOS, *Joint Motion*, 1965, flexion: MCP 90°, PIP 100°, DIP
 90°, thumb MCP 50° and IP 80°), most of them widened to take in passive reach; the MCP joints'
 extension is less than the 45° there."""
+LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
+"""`[26]` radians each: those ranges."""
+ANGLES_OF_FINGER = [[i for i, a in enumerate(ANGLES) if a.joint.startswith(f)] for f in FINGERS]
+"""The indices of each finger's angles."""
+FINGER_OF_ANGLE = np.repeat(np.arange(len(FINGERS)), [len(own) for own in ANGLES_OF_FINGER])
+"""`[26]` the index in `FINGERS` of the finger that each angle moves."""
+SLOT_OF_ANGLE = np.concatenate([np.arange(len(own)) for own in ANGLES_OF_FINGER])
+"""`[26]` its number among that finger's."""
+FINGER_OF_POINT = np.array([-1, *(i // 3 for i in range(15)), *range(5)])
+"""`[21]` the finger of each point; −1 for the wrist."""
 
 OPENXR = {
     "wrist": "XR_HAND_JOINT_WRIST_EXT",

@@ -187,7 +187,7 @@ def write(recording: Recording, path: str | os.PathLike[str], *, overwrite: bool
     names that the format cannot hold, FileExistsError for a file that is there already.
     """
     path = Path(path)
-    writer = _writer(path)
+    writer = writer_of(path)
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists; pass overwrite=True to replace it")
     with TemporaryDirectory(dir=path.parent, prefix=".jaxhand-") as directory:
@@ -241,7 +241,8 @@ def _reader(path: Path, format: str | None) -> ModuleType:
     raise ValueError(f"{path}: unknown suffix {suffix!r}; known: {', '.join(known)}")
 
 
-def _writer(path: Path) -> ModuleType:
+def writer_of(path: Path) -> ModuleType:
+    """What writes files with this suffix; ValueError if nothing does."""
     plugins = _plugins()
     suffix = path.suffix.lower()
     if suffix in WRITER_OF:

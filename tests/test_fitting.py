@@ -9,11 +9,10 @@ pytest.importorskip("jax")
 
 from jaxhand.fitting import angle_deviation, fit_angles, rest_directions
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, POINTS, load_hand
+from numpy_infer.hand import ANGLES, HIGH, LOW, POINTS, load_hand
 from numpy_infer.skeleton import forward_kinematics, rotations_from_angles
 
 SKELETON = load_hand("glove9").skeleton
-LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
 TWISTS = np.array([angle.name.endswith("_twist") for angle in ANGLES])
 
 

@@ -11,13 +11,14 @@ pytest.importorskip("jax")
 pytest.importorskip("tyro")
 
 from fitted import fitted_model
+from rich.console import Console
 from simulated import motion, worn
 
-from jaxhand import cli
-from numpy_infer import load_hand, model, wearer
+from jaxhand import cli, glove
+from numpy_infer import HandTracker, load_hand, model, wearer
 from numpy_infer.geometry import mirror
 from numpy_infer.hand import POINTS
-from numpy_infer.recordings import Recording, write
+from numpy_infer.recordings import Recording, read, write
 
 GLOVE = load_hand("glove9")
 RATE, SECONDS, LARGER = 60.0, 6, 1.12
@@ -54,6 +55,19 @@ def test_a_larger_hand_is_found_to_be_larger(side: str, folder: Path, tmp_path: 
     assert cli.calibrate(arguments) == 2, "nothing is overwritten unasked"
 
 
+def test_a_larger_hand_held_as_it_was_when_flat_is_flat(folder: Path, tmp_path: Path) -> None:
+    """What is taken off is what the model says that will run, on the person's own bones."""
+    out = tmp_path / "me.json"
+    held = read(folder / "left.csv").markers[: round(0.8 * RATE)]
+    config = glove.CalibrateConfig(
+        recording=folder / "left.csv", out=out, model=folder / "model.npz", flat=(0, 0.79)
+    )
+    glove.calibrate_person(config, Console(quiet=True))
+    tracker = HandTracker.load(folder / "model.npz", calibration=out)
+    angles = np.array([tracker.step(markers, 1 / RATE).angles for markers in held])
+    assert np.degrees(np.abs(angles.mean(0)).max()) < 0.05
+
+
 def test_a_glove_is_described_by_its_motion(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "mine.json"
     assert cli.hand([str(folder / "left.csv"), "--like", "glove9", "-o", str(out)]) == 0
@@ -72,20 +86,37 @@ def test_a_glove_is_described_by_its_motion(folder: Path, tmp_path: Path) -> Non
         ({"--model": "nothing.npz"}, "no model file nothing.npz"),
         ({"--flat": "20"}, "no frame with all markers"),
         ({"recording": "nothing.csv"}, "nothing.csv"),
+        ({"out": "nodir/me.json"}, "nodir is no folder: make it first"),
+        ({"out": "."}, "is a folder: choose another name"),
     ],
 )
-def test_a_mistake_is_one_clear_line(
+def test_a_mistake_is_one_clear_line_before_the_fit(
     change: dict[str, str],
     message: str,
     folder: Path,
     tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    given = {"--model": str(folder / "model.npz"), "--flat": "0", **change}
+    monkeypatch.setattr(glove, "hand_size", lambda *_: pytest.fail("fitted first"))
+    given = {"--model": str(folder / "model.npz"), "--flat": "0", "out": "me.json", **change}
     recording = change.get("recording", str(folder / "left.csv"))
-    arguments = [recording, "-o", str(tmp_path / "me.json"), "--model", given["--model"]]
+    arguments = [recording, "-o", str(tmp_path / given["out"]), "--model", given["--model"]]
     assert cli.calibrate([*arguments, "--flat", given["--flat"], "30"]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "me.json").exists()
+
+
+@pytest.mark.parametrize("out", ["nodir/mine.json", "."])
+def test_a_wrong_output_is_refused_before_the_glove_is_fitted(
+    out: str,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(glove, "new_hand", lambda *_, **__: pytest.fail("fitted first"))
+    assert cli.hand([str(folder / "left.csv"), "-o", str(tmp_path / out)]) == 2
+    assert "folder" in capsys.readouterr().err

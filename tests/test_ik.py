@@ -11,12 +11,11 @@ pytest.importorskip("jax")
 
 from jaxhand.ik import Solved, ccd
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, CHAINS, JOINTS, POINTS, Hand, load_hand
+from numpy_infer.hand import ANGLES, CHAINS, HIGH, JOINTS, LOW, POINTS, Hand, load_hand
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
 GLOVE = load_hand("glove9")
 NAMES = [angle.name for angle in ANGLES]
-LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
 FINGER_MARKERS = [m for m, link in enumerate(GLOVE.links) if JOINTS[link] != "wrist"]
 COUNT = 40
 BOTH = pytest.mark.parametrize("tuned", [False, True])

@@ -18,7 +18,7 @@ from jaxhand import report
 from jaxhand.joint_evaluation import Row
 from jaxhand.sequences import Dataset, Sequence
 from jaxhand.sparse_fit import prior_of
-from numpy_infer import load_hand
+from numpy_infer import load_hand, tracker
 from numpy_infer.arrays import Array
 
 GLOVE = load_hand("glove9")
@@ -46,13 +46,13 @@ def test_rows_stand_on_the_data_sets_bones_but_the_uncalibrated_one(dataset: Dat
     rows = evaluation.rows(with_posture(dataset), dataset, {"learned_paper": with_posture(dataset)})
     assert list(rows) == [
         *("ik", "ik_tuned", "least_squares"),
-        *("learned", "learned_uncalibrated", "learned_paper"),
+        *("learned", "learned_unaligned", "learned_uncalibrated", "learned_paper"),
     ]
     for name, row in rows.items():
         bones = GLOVE.skeleton if name == "learned_uncalibrated" else dataset.hand.skeleton
         if row.solve is None:
             np.testing.assert_array_equal(row.model.body.skeleton, bones)
-            assert row.model.alignment
+            assert row.model.alignment == (name != "learned_unaligned")
     plain = a_model("learned", joints=True)
     assert "least_squares" not in evaluation.rows(plain, dataset)
 
@@ -64,6 +64,32 @@ def test_rows_stand_on_the_data_sets_markers_too(dataset: Dataset) -> None:
     for name in ("learned", "other"):
         np.testing.assert_array_equal(rows[name].model.body.offsets, worn.hand.offsets)
         np.testing.assert_array_equal(rows[name].model.body.template, worn.hand.template)
+
+
+def test_without_alignment_the_joints_are_measured_with_nothing_hidden(dataset: Dataset) -> None:
+    row, told = evaluation.rows(with_posture(dataset), dataset)["learned_unaligned"], []
+    table = evaluation.table4(
+        {"learned_unaligned": row}, dataset, seeds=1, report=lambda *of: told.append(of)
+    )["learned_unaligned"]
+    assert told == [("learned_unaligned", 1.0)], "its bar is full"
+    cells = [cell for count in "1234" for cell in table[count].values()]
+    assert len(cells) == 4 * 5
+    assert {cell["n"] for cell in cells} == {0}
+
+    markers, truth = (
+        np.concatenate([getattr(s, name)[25:] for s in dataset.sequences])
+        for name in ("markers", "positions")
+    )
+    seen, dt = np.ones(markers.shape[:-1], bool), np.full(len(markers), 1 / 60)
+    off = []
+    for alignment in (False, True):
+        model = replace(row.model, alignment=alignment)
+        start = tracker.init(model, (len(markers),))
+        positions = tracker.step(model, start, markers, seen, dt)[1].positions
+        off.append(1e2 * np.linalg.norm(positions - truth, axis=-1)[:, evaluation.POINTS].mean())
+    assert table["0"]["n"] == len(markers)
+    assert table["0"]["mean"] == pytest.approx(off[0], rel=1e-4)
+    assert table["0"]["mean"] != pytest.approx(off[1], rel=0.01)
 
 
 def test_the_noise_floor_is_a_row_with_nothing_hidden(dataset: Dataset) -> None:
@@ -158,3 +184,8 @@ def test_the_printed_table_holds_the_figures() -> None:
     console = Console(width=80, record=True)
     report.print_table4({"learned": row}, console)
     assert console.export_text().count("0.12 ±0.05") == 21
+    nothing_hidden = {"0": cell, **evaluation._not_measured()}
+    report.print_table4({"alone": nothing_hidden, "learned": row}, console)
+    text = console.export_text()
+    assert text.count("0.12 ±0.05") == 22
+    assert "–" not in text, "what is not measured takes no lines"

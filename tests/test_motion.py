@@ -14,13 +14,12 @@ from simulated import quickly  # noqa: E402
 from jaxhand import contact, motion  # noqa: E402
 from jaxhand.anthropometry import mean_person, people  # noqa: E402
 from jaxhand.motion import KEYFRAMES, Motion  # noqa: E402
-from numpy_infer.hand import ANGLES, FINGERS, TIPS, load_hand  # noqa: E402
+from numpy_infer.hand import ANGLES, FINGERS, HIGH, LOW, TIPS, load_hand  # noqa: E402
 
 RATE, COUNT, LENGTH = 60.0, 32, 900
 GLOVE = load_hand("glove9")
 PERSON = mean_person(GLOVE)
 NAMES = [angle.name for angle in ANGLES]
-LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
 
 
 @functools.cache

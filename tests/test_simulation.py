@@ -15,7 +15,7 @@ from simulated import quickly  # noqa: E402
 from jaxhand import simulation  # noqa: E402
 from jaxhand.anthropometry import PLACEMENT  # noqa: E402
 from jaxhand.simulation import Streams  # noqa: E402
-from numpy_infer.hand import ANGLES, PARENTS, POINTS, load_hand  # noqa: E402
+from numpy_infer.hand import ANGLES, HIGH, LOW, PARENTS, POINTS, load_hand  # noqa: E402
 from numpy_infer.skeleton import (  # noqa: E402
     forward_kinematics,
     marker_positions,
@@ -113,10 +113,9 @@ def test_everybody_has_bones_and_marker_places_of_their_own() -> None:
 
 @pytest.mark.parametrize("name", ["streams", "frames"])
 def test_angles_stay_in_their_ranges(name: str) -> None:
-    low, high = np.radians([angle.range_deg for angle in ANGLES]).T
     _, angles = of_both(name)
-    assert (angles >= low - 1e-5).all()
-    assert (angles <= high + 1e-5).all()
+    assert (angles >= LOW - 1e-5).all()
+    assert (angles <= HIGH + 1e-5).all()
 
 
 def test_postures_are_those_of_a_hand() -> None:

@@ -19,12 +19,11 @@ from jaxhand.ik import Solved, ccd
 from jaxhand.sparse_fit import PosePrior, least_squares, prior_of
 from jaxhand.tasks import JOINT_POINTS
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, Hand, load_hand
+from numpy_infer.hand import ANGLES, HIGH, LOW, Hand, load_hand
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
 GLOVE, DENSE = load_hand("glove9"), load_hand("dense19")
 NAMES = [angle.name for angle in ANGLES]
-LOW, HIGH = np.radians([angle.range_deg for angle in ANGLES]).T
 COUNT = 40
 _RANDOM = np.random.default_rng(1)
 POSTURES = _RANDOM.normal(0.3, 0.25, (500, 1)) * (HIGH > 1)
