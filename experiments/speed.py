@@ -188,9 +188,12 @@ def print_offline(model: Model, rounds: int, frames: int = 2048, hands: int = 64
     features = markers[some].reshape(-1, hands, 3 * len(model.hand))
     run = compiled(lambda state, *arrays: jax_tracker.run(model, state, *arrays)[1])
     start, both = jax_tracker.init(model, (hands,)), jax.jit(networks)
+    gated = replace(model, gate=True)
     runs: dict[str, Callable[[], Any]] = {
         "numpy, gaps": lambda: tracker.run(model, tracker.init(model), *one),
         "numpy, no gaps": lambda: tracker.run(model, tracker.init(model), *full),
+        "numpy, gaps, gate": lambda: tracker.run(gated, tracker.init(gated), *one),
+        "numpy, no gaps, gate": lambda: tracker.run(gated, tracker.init(gated), *full),
         "JAX": lambda: jax.block_until_ready(run(start, markers[some], visible[some], dt[some])),
         "JAX, two networks": lambda: jax.block_until_ready(both(features)),
     }

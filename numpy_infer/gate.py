@@ -215,9 +215,7 @@ def step(
     alike = state.calm.all() and (visible == state.visible).all()
     if told and alike and far.max() < QUIET**2 and dt.min() > BRIEFEST:
         return _quietly(state, markers, moved, visible, dt), visible
-    told = (moved != 0).sum((-1, -2)) == 3 * visible.sum(-1)
-    alike = state.calm & (visible == state.visible).all(-1)
-    quiet = told & alike & (far.max(-1) < QUIET**2) & (dt > BRIEFEST)
+    quiet = state.calm & _quiet(moved, state.velocity, visible, state.visible, dt)
     repeated = ~(dt > 0) & (visible == state.visible).all(-1) & (moved == 0).all((-1, -2))
     careful = _carefully(model, state, markers, visible, last, tracked, dt)
     quick = _quietly(state, markers, moved, visible, np.maximum(dt, BRIEFEST))
@@ -230,35 +228,87 @@ def step(
     return merged, merged.accepted
 
 
-def quietly(state: GateState, markers: Array, visible: Array, dt: Array) -> GateState | None:
-    """The state after several frames `[T, ..., M, 3]`, all of them accepted, if they are all quiet;
-    else None. Arguments as of `step`, with T in front."""
-    if not (state.calm.all() and (visible == state.visible).all() and dt.min() > BRIEFEST):
-        return None
-    moved = np.diff(markers, axis=0, prepend=state.markers[None])
-    velocity = np.concatenate([state.velocity[None], moved[:-1] / dt[:-1, ..., None, None]])
-    far = _off(moved, velocity, dt)
-    told = np.count_nonzero(moved) == 3 * np.count_nonzero(visible)
-    if not told or far.max() >= QUIET**2:
-        return None
-    last = _quietly(state, markers[-1], moved[-1], visible[-1], dt[-1])
-    fade = np.prod(1 + dt / CALM_SECONDS, 0)
-    age = np.where(visible[-1], 0, state.age + dt.sum(0)[..., None])
-    return last._replace(restless=state.restless / fade, age=age)
+def ahead(
+    model: Model, state: GateState, tracked: Array, markers: Array, visible: Array, dt: Array
+) -> tuple[GateState, int]:
+    """The state after as many of several frames as pass whole without the tracker's output having
+    a say, and how many those are: up to one in which a marker comes back, or is refused. Arguments
+    as of `step`, with T in front."""
+    if not state.calm.all():
+        return state, 0
+    # What each frame would find if all before it pass.
+    earlier, seen = (
+        np.concatenate([own[None], rest[:-1]])
+        for own, rest in ((state.markers, markers), (state.visible, visible))
+    )
+    moved, time = markers - earlier, dt[..., None]
+    speed = np.where(visible[..., None], moved, 0) / np.maximum(time, BRIEFEST)[..., None]
+    velocity = np.concatenate([state.velocity[None], speed[:-1]])
+    count = _until((visible & ~seen).any(-1) | (dt <= BRIEFEST))
+    restless = ~_quiet(moved, velocity, visible, seen, dt)
+    level = np.zeros_like(dt)
+    at = np.flatnonzero(_any(restless[:count]))
+    if len(at):
+        nothing = np.zeros_like(velocity[at])
+        found = GateState(
+            markers=earlier[at],
+            visible=seen[at],
+            accepted=seen[at],
+            place=earlier[at],
+            velocity=velocity[at],
+            followed=seen[at],
+            calm=np.ones_like(restless[at]),
+            age=nothing[..., 0],
+            refused=nothing[..., 0],
+            leap=nothing,
+            restless=nothing[..., 0, 0],  # what passes like that passes where more is allowed
+        )
+        found = _carefully(model, found, markers[at], visible[at], markers[at], tracked, dt[at])
+        level[at] = np.where(restless[at], found.restless, 0)
+        passed = _until((found.accepted != visible[at]).any(-1))
+        count = int(at[passed]) if passed < len(at) else count
+    if not count:
+        return state, 0
+    last, done = count - 1, slice(count)
+    fade = np.cumsum(np.log1p(dt[done] / CALM_SECONDS), 0)
+    lasting = np.logical_or.accumulate(visible[done][::-1], 0)[::-1]
+    unseen = (time[done] * ~lasting).sum(0)
+    state = GateState(
+        markers=markers[last],
+        visible=visible[last],
+        accepted=visible[last],
+        place=markers[last],
+        velocity=speed[last],
+        followed=visible[last],
+        calm=state.calm,
+        age=np.where(lasting[0], unseen, state.age + unseen),
+        refused=state.refused,
+        leap=np.zeros_like(state.leap),
+        restless=np.maximum(
+            state.restless * np.exp(-fade[last]),
+            (level[done] * np.exp(fade - fade[last])).max(0),
+        ),
+    )
+    return state, count
 
 
-def unquiet(markers: Array, visible: Array, dt: Array) -> Array:
-    """`[T]` True where frames `[T, ..., M, 3]` look as if one will not be quiet: `quietly` is best
-    asked of those between. The first two always do."""
-    moved = np.diff(markers, axis=0)
-    velocity = moved[:-1] / np.maximum(dt[1:-1], BRIEFEST)[..., None, None]
-    told = (moved[1:] != 0).sum((-1, -2)) == 3 * visible[2:].sum(-1)
-    alike = (visible[2:] == visible[1:-1]).all(-1)
-    quiet = told & alike & (dt[2:] > BRIEFEST)
-    quiet &= _off(moved[1:], velocity, dt[2:]).max(-1) < QUIET**2
-    found = np.ones(len(markers), bool)
-    found[2:] = ~quiet.all(tuple(range(1, quiet.ndim)))
-    return found
+def _any(of_frames: Array) -> Array:
+    """`[T]` of `[T, ...]`."""
+    return of_frames.any(tuple(range(1, of_frames.ndim)))
+
+
+def _until(stop: Array) -> int:
+    """How many frames `[T, ...]` come before one in which any hand stops."""
+    stops = np.flatnonzero(_any(stop))
+    return int(stops[0]) if len(stops) else len(stop)
+
+
+def _quiet(moved: Array, velocity: Array, visible: Array, before: Array, dt: Array) -> Array:
+    """`[...]` True where a frame goes on as the one before, in which `before` was visible."""
+    # A coordinate that is the same again may be a frozen one.
+    told = (moved != 0).sum((-1, -2)) == 3 * visible.sum(-1)
+    alike = (visible == before).all(-1)
+    return told & alike & (_off(moved, velocity, dt).max(-1) < QUIET**2) & (dt > BRIEFEST)
 
 
 def _off(moved: Array, velocity: Array, dt: Array) -> Array:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numpy_infer import gate
 from numpy_infer.arrays import Array
 from numpy_infer.continuity import (
     FARTHEST_CORRECTION,
@@ -32,14 +31,11 @@ from numpy_infer.pose import State
 
 def together(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State | None:
     """The states, an axis in front or 1 in its place, after each of several frames `[T, ..., M, 3]`
-    of clean input; None if a hand's motion is not plain in all of them, or one is not quiet for the
-    gate. For a predictor that looks at one frame alone, and for frames whose visible markers
-    determine the hand, which the caller sees to.
+    of clean input; None if a hand's motion is not plain in all of them. For a predictor that looks
+    at one frame alone, for frames whose visible markers determine the hand, and that pass the gate,
+    which the caller sees to: the gate's state is as before.
     """
     if np.count_nonzero(state.tracking) < state.tracking.size:
-        return None
-    own = gate.quietly(state.gate, markers, visible, dt) if model.gate else state.gate
-    if own is None:
         return None
     weight = visible.astype(markers.dtype)
     template = model.hand.template.astype(markers.dtype, copy=False)
@@ -52,7 +48,7 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         *(model, state.predictor, registered, markers, visible, markers, dt),
         *((rotation, translation), (rotation, translation)),
     )
-    state, own = (each(lambda leaf: leaf[None], tree) for tree in (state, own))
+    state = each(lambda leaf: leaf[None], state)
     frames = Frame(
         predictor,
         state.tracking,
@@ -82,8 +78,7 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
             **_chained(model, state, frames, changes, visible, elapsed, changed, at)
         )
     state = state._replace(known=state.known | np.logical_or.accumulate(visible, 0))
-    states = blended(model, state, frames, markers, visible, weight, elapsed)
-    return states._replace(gate=own)
+    return blended(model, state, frames, markers, visible, weight, elapsed)
 
 
 class _Changes(NamedTuple):

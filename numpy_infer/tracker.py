@@ -128,19 +128,23 @@ def run(
         alone = (late | ~determined).any(tuple(range(1, late.ndim)))
         begins[1:] = alone[1:] | alone[:-1]
         if model.gate:
-            begins |= gate.unquiet(markers, visible, elapsed)
+            begins[1:] |= (visible[1:] & ~visible[:-1]).any(tuple(range(1, visible.ndim)))
     starts = [*np.flatnonzero(begins), count]
     for start, end in pairwise(starts):
         done, ahead = start, count
         while done < end:
             frames = slice(done, min(done + ahead, end) if done > start else start + 1)
-            several = frames.stop - done > 1
-            states = several and together(
-                model, state, markers[frames], visible[frames], elapsed[frames]
-            )
+            own, asked = state.gate, (markers[frames], visible[frames], elapsed[frames])
+            if model.gate and len(asked[0]) > 1:
+                own, passed = gate.ahead(model, own, state.tracked, *asked)
+                frames, asked = slice(done, done + passed), tuple(part[:passed] for part in asked)
+            several = len(asked[0]) > 1
+            states = several and together(model, state, *asked)
             # After a refusal less is asked for, or a recording would be gone through endlessly.
-            ahead = 2 * ahead if states or not several else 2
-            if not states:
+            ahead = min(2 * ahead, count) if states or not several else 2
+            if states:
+                states = states._replace(gate=each(lambda leaf: leaf[None], own))
+            else:
                 frames = slice(done, done + 1)
                 one = markers[done], visible[done], elapsed[done], late[done]
                 states = each(lambda leaf: leaf[None], advance(model, state, *one))

@@ -308,25 +308,44 @@ def test_a_frame_again_without_time_changes_nothing(seed: int, frame: int) -> No
     np.testing.assert_array_equal(repeated[0], accepted[-1])
 
 
-@given(seed=seeds())
-def test_frames_that_look_quiet_beforehand_are(seed: int) -> None:
-    """Or a recording would be cut where it need not, or asked about in vain, again and again. What
-    was refused shortly before has no velocity of its own yet."""
+def in_one_go(model: Model, what: Given, state: GateState) -> tuple[GateState, int]:
+    tracked = np.ones(what.dt.shape[1:], bool)
+    return gate.ahead(model, state, tracked, what.markers, what.visible, what.dt)
+
+
+@given(seed=seeds(), pattern=st.sampled_from(sorted(PATTERNS)))
+def test_frames_that_pass_in_one_go_pass_one_by_one(seed: int, pattern: str) -> None:
     model = MODELS["glove9"]
-    truth = calm(model.hand, seed, hands=1)
-    truth[20:, 0, 3] += 0.02  # a step, and a frame told twice
-    truth[40] = truth[39]
-    what, state = asked(truth), gate.init(model, (1,))
-    seen, calm_for = [], 0
-    for t, unquiet in enumerate(gate.unquiet(what.markers, what.visible, what.dt)):
-        one = slice(t, t + 1)
-        quiet = gate.quietly(state, what.markers[one], what.visible[one], what.dt[one]) is not None
-        calm_for = calm_for + 1 if state.calm.all() else 0
-        if calm_for > 1:
-            seen.append((quiet, not unquiet))
-        _, state = run(model, Given(*(part[one] for part in what)), state)
-    assert all(quiet == looks for quiet, looks in seen)
-    assert {looks for _, looks in seen} == {True, False}
+    what = faulty(model, seed, pattern)
+    what = Given(*(part[:, :1] for part in what))
+    _, state = run(model, Given(*(part[:1] for part in what)))
+    done = 1
+    while done < len(what.dt):
+        left = Given(*(part[done:] for part in what))
+        after, passed = in_one_go(model, left, state)
+        # What does not pass in one go is taken by itself.
+        mine = Given(*(part[: max(passed, 1)] for part in left))
+        accepted, state = run(model, mine, state)
+        if passed:
+            np.testing.assert_array_equal(accepted, mine.visible)
+            for one, other in zip(after, state, strict=True):
+                assert one.dtype == other.dtype
+                np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
+        done += len(mine.dt)
+
+
+@given(seed=seeds(), hidden=st.sets(st.integers(0, 8), max_size=4))
+def test_what_is_right_passes_in_one_go_until_a_marker_comes_back(
+    seed: int, hidden: set[int]
+) -> None:
+    model = MODELS["glove9"]
+    truth = calm(model.hand, seed, frames=120, hands=2)
+    visible = np.ones(truth.shape[:-1], bool)
+    visible[40:100, 1, list(hidden)] = False
+    what = asked(truth, visible=visible)
+    _, state = run(model, Given(*(part[:2] for part in what)))
+    _, passed = in_one_go(model, Given(*(part[2:] for part in what)), state)
+    assert passed == (98 if hidden else 118)
 
 
 @given(seed=seeds())

@@ -34,7 +34,7 @@ ONE_SIDED = {
     "skeleton": {"align_fingers", "finger_forms", "end_arms"},
     # For many frames at once, in `offline`: JAX scans over them.
     "continuity": {"blend", "blended", "each", "fill", "posture_change"},
-    "gate": {"quietly", "unquiet", "reach"},  # and a table that both sides share
+    "gate": {"ahead", "reach"},  # and a table that both sides share
     # The spec and its file format exist once, in numpy; the flax module only beside JAX.
     "networks": {
         *("array_shapes", "read_spec", "write_spec"),
