@@ -3,6 +3,7 @@
 Simulated people in the model's glove, each with bones of their own and markers not quite in place.
 Twenty seconds of free motion calibrate, the ten after them are measured: mean error of the joints
 through the whole pipeline for the model's hand, for one of the size found, and on the true bones.
+The 95 % interval of the difference, by seconds, says who is worse off beyond chance.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import jax
 import numpy as np
 
 from jaxhand import simulation
+from jaxhand.evaluation import interval
 from jaxhand.hand_size import hand_size
 from jaxhand.joint_evaluation import POINTS, evaluate_poses
 from numpy_infer.arrays import Array
@@ -37,26 +39,34 @@ def main() -> None:
     streams = simulation.streams(key, model.hand, options.people, frames, RATE)
     noise = NOISE * np.random.default_rng(0).standard_normal(streams.markers.shape)
     markers = np.asarray(streams.markers, np.float64) + noise
-    rows = []
+    rows, beyond = [], 0
     for person in range(options.people):
         true = model.hand.with_skeleton(np.asarray(streams.skeleton[person]))
         found = model.hand.resized(hand_size(model, markers[person, :split]).factor)
         truth = np.asarray(streams.positions[person, split:])
-        rows.append(
-            [error(model, on, markers[person, split:], truth) for on in (model.hand, found, true)]
+        before, after, best = (
+            errors(model, on, markers[person, split:], truth) for on in (model.hand, found, true)
         )
-        print(f"person {person}: {rows[-1][0]:.2f} → {rows[-1][1]:.2f} cm", flush=True)
-    before, after, best = np.mean(rows, 0)
+        rows.append([each.mean() for each in (before, after, best)])
+        seconds = (after - before).reshape(-1, round(RATE))
+        worse = interval(seconds.sum(-1), np.full(len(seconds), seconds.shape[1]))
+        beyond += worse["low"] is not None and worse["low"] > 0
+        print(
+            f"person {person}: {rows[-1][0]:.2f} → {rows[-1][1]:.2f} cm, "
+            f"difference {worse['mean']:.3f} ({worse['low']:.3f} to {worse['high']:.3f})",
+            flush=True,
+        )
+    means = np.mean(rows, 0)
     worse = sum(row[1] > row[0] for row in rows)
-    print(
-        f"joints, cm: {before:.3f} uncalibrated, {after:.3f} calibrated, {best:.3f} on true bones"
-    )
-    print(f"{worse} of {len(rows)} people are worse off")
+    print("joints, cm: {:.3f} uncalibrated, {:.3f} calibrated, {:.3f} on true bones".format(*means))
+    print(f"{worse} of {len(rows)} people are worse off, {beyond} beyond chance")
 
 
-def error(model: Model, hand: Hand, markers: Array, truth: Array) -> float:
+def errors(model: Model, hand: Hand, markers: Array, truth: Array) -> Array:
+    """`[T]` cm."""
     poses = evaluate_poses(worn_by(model, hand), markers.astype(np.float32))
-    return float(1e2 * np.linalg.norm(poses.positions - truth, axis=-1)[:, POINTS].mean())
+    off: Array = 1e2 * np.linalg.norm(poses.positions - truth, axis=-1)[:, POINTS].mean(-1)
+    return off
 
 
 if __name__ == "__main__":
