@@ -52,8 +52,8 @@ def main() -> None:
         worse = interval(seconds.sum(-1), np.full(len(seconds), seconds.shape[1]))
         beyond += worse["low"] is not None and worse["low"] > 0
         print(
-            f"person {person}: {rows[-1][0]:.2f} → {rows[-1][1]:.2f} cm, "
-            f"difference {worse['mean']:.3f} ({worse['low']:.3f} to {worse['high']:.3f})",
+            "person {}: {:.2f} → {:.2f} cm, {:.2f} on true bones, ".format(person, *rows[-1])
+            + "difference {mean:.3f} ({low:.3f} to {high:.3f})".format(**worse),
             flush=True,
         )
     means = np.mean(rows, 0)
