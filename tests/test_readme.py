@@ -58,7 +58,8 @@ def test_the_python_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     save(Model(hand), tmp_path / "model.npz")
     hidden = hand.template.copy()
     hidden[3] = np.nan
-    space = {"stream": [(hand.template, 1 / 60), (hidden, 1 / 60)]}
+    recordings = np.float32(np.stack([[hand.template, hidden], [hidden, hand.template]]))
+    space = {"stream": [(hand.template, 1 / 60), (hidden, 1 / 60)], "recordings": recordings}
     try:
         for block in blocks("python"):
             exec(compile(block, "README.md", "exec"), space)
@@ -72,6 +73,7 @@ def test_the_python_blocks_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             PREDICTORS.pop(name, None)
             predictors.PREDICTORS.pop(name, None)
     assert np.isfinite(space["pose"].markers).all()  # type: ignore[attr-defined]
+    assert np.isfinite(space["angles"]).all()  # type: ignore[arg-type]
     assert blocks("python")
 
 
