@@ -24,7 +24,11 @@ def train(arguments: list[str]) -> int:
         print(f"jaxhand train: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("jaxhand train: interrupted, and no model was written", file=sys.stderr)
+        print(
+            "jaxhand train: interrupted, and no model was written; --resume goes on from the last "
+            "epoch, if there was one",
+            file=sys.stderr,
+        )
         return 130
     return 0
 

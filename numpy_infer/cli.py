@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 
 from numpy_infer import wearer
-from numpy_infer.hand import Hand, bundled, load_hand
+from numpy_infer.hand import ANGLES, Hand, bundled, load_hand
 from numpy_infer.model import Model, load
 from numpy_infer.model import bundled as bundled_models
 from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import Notice, Status, TrackingState
 from numpy_infer.predictors import BASELINES, PREDICTORS
 from numpy_infer.recordings import Recording, load_label_map, read, write, writer_of
-from numpy_infer.tracking import Tracked, prefixed, track, track_hands
+from numpy_infer.tracking import Tracked, as_measured, prefixed, track, track_hands
 
 VERBS = {
     "train": "train both networks on recordings of hands",
@@ -129,6 +129,12 @@ def parser() -> argparse.ArgumentParser:
         metavar="HZ",
         help="let less jitter through, for some lag; HZ is the cutoff at rest (default "
         f"{Smoothing().min_cutoff:g})",
+    )
+    tracked.add_argument(
+        "--as-measured",
+        action="store_true",
+        help="write what was measured as it was, also just after a gap: a marker that comes back "
+        "then jumps to where it is instead of being led there",
     )
     tracked.add_argument("--overwrite", action="store_true", help="replace OUT if it exists")
     tracked.set_defaults(run=_track)
@@ -256,7 +262,7 @@ def _track(options: argparse.Namespace) -> None:
         smoothing = Smoothing(options.smooth)
         model = replace(model, smoothing=smoothing)
         at_rest, moving = (1e3 * smoothing.lag(speed) for speed in (0, 1))
-        print(f"smoothed: {at_rest:.0f} ms late at rest, {moving:.0f} ms at 1 m/s")
+        print(f"smoothed: {at_rest:.0f} ms late at rest, {moving:.0f} ms at a steady 1 m/s")
     if options.calibration:
         model = wearer.calibrated(model, wearer.load(options.calibration))
     show = sys.stderr.isatty()
@@ -273,10 +279,14 @@ def _track(options: argparse.Namespace) -> None:
         results = track_hands(hands, model, right=sides, report=report)
     if show:
         print(file=sys.stderr)
+    if options.as_measured:
+        results = [as_measured(result, hand) for result, hand in zip(results, hands, strict=True)]
     for (side, output), result in zip(outputs.items(), results, strict=True):
         write(result.recording, output, overwrite=options.overwrite)
         if len(outputs) > 1:
             print(f"{side} hand")
+        elif side == "left" and "right" in options.file.stem.lower():
+            print("tracked as a left hand, though the file's name says right: see --right")
         print(_summary(result))
         print(f"wrote {output}")
 
@@ -289,6 +299,11 @@ def _outputs(options: argparse.Namespace) -> dict[str, Path]:
     if options.right and options.left_prefix:
         raise ValueError("--right goes with --right-prefix, not with --left-prefix")
     return {"right" if options.right or options.right_prefix else "left": out}
+
+
+BENT_BACK = -25.0
+"""Degrees: fingers whose knuckles are flexed less, half of the time, are somebody else's."""
+_KNUCKLES = [i for i, a in enumerate(ANGLES) if a.name.endswith("mcp_flexion") and i > 5]
 
 
 def _summary(result: Tracked) -> str:
@@ -309,6 +324,14 @@ def _summary(result: Tracked) -> str:
     if hidden.any():
         error = 1e3 * result.expected_error[hidden].mean()
         lines.append(f"filled markers are expected to be {error:.0f} mm off on average")
+    angles = result.recording.angles
+    if angles is None:
+        lines.append("no joint angles: the model has no joint network, or is not to use it")
+    elif np.nanmedian(np.degrees(angles[:, _KNUCKLES])) < BENT_BACK:
+        lines.append(
+            "the fingers look bent backwards at the knuckles: is it a right hand (--right), and do "
+            "the markers sit where the model has them (jaxhand hand)?"
+        )
     for value, text in ((TrackingState.DEGRADED, "degraded"), (TrackingState.LOST, "lost")):
         if (state == value).any():
             lines.append(f"{100 * (state == value).mean():6.2f} % of the frames {text}")
@@ -348,9 +371,21 @@ def _fitting_hand(labels: Sequence[str], instead: str) -> Hand:
     if not fits:
         raise ValueError(
             f"no bundled hand fits the labels {', '.join(labels)}: rename them with --map, or "
-            f"pass {instead}"
+            f"pass {instead}{_nearly(labels)}"
         )
     return max(map(load_hand, fits), key=len)
+
+
+def _nearly(labels: Sequence[str]) -> str:
+    """What else could be done, if but little is missing."""
+    lacking = {name: set(load_hand(name).markers) - set(labels) for name in bundled()}
+    name = min(lacking, key=lambda name: len(lacking[name]))
+    if len(lacking[name]) <= len(load_hand(name)) // 3:
+        return f"; {name} lacks {', '.join(sorted(lacking[name]))}: an empty column would do"
+    markers = load_hand(name).markers
+    if any(label.endswith(f"_{marker}") for label in labels for marker in markers):
+        return "; what labels of a hand begin with is said by --left-prefix or --right-prefix"
+    return ""
 
 
 def _hands(options: argparse.Namespace) -> None:

@@ -218,12 +218,15 @@ def load_label_map(path: str | os.PathLike[str]) -> dict[str, str]:
 
 def median_rate(time: np.ndarray, source: object) -> float:
     """Hz from [T] seconds: the median of 1 / diff over the steps that go forward, by a nanosecond
-    at least."""
+    at least; where all steps are about alike their mean, for times may be rounded."""
     steps = np.diff(time)
-    steps = steps[steps >= 1e-9]
-    if not steps.size:
+    forward = steps[steps >= 1e-9]
+    if not forward.size:
         raise ValueError(f"{source}: no rate: the file states none and its time never advances")
-    return float(np.median(1.0 / steps))
+    median = np.median(1.0 / forward)
+    if (np.abs(steps * median - 1) < 0.5).all():
+        return float(len(steps) / (time[-1] - time[0]))
+    return float(median)
 
 
 def _reader(path: Path, format: str | None) -> ModuleType:

@@ -96,6 +96,15 @@ def track_hands(
     ]
 
 
+def as_measured(result: Tracked, recording: Recording) -> Tracked:
+    """The same with what was measured, and believed, as it was: a marker that comes back then jumps
+    to where it is instead of being led there."""
+    own = recording.select(result.recording.names)
+    seen = (result.status == Status.OBSERVED)[..., None]
+    markers = np.where(seen, own.markers, result.recording.markers)
+    return replace(result, recording=replace(result.recording, markers=markers))
+
+
 def _part(report: Callable[[float], None], number: int, of: int, share: float) -> None:
     report((number + share) / of)
 
@@ -120,12 +129,13 @@ def _tracked(recording: Recording, model: Model, poses: Sequence[HandPose]) -> T
     begun = np.logical_or.accumulate(state == TrackingState.TRACKING)
     if model.predictor == "none":
         markers = np.where((status == Status.OBSERVED)[..., None], markers, np.nan)
+    some = (status != Status.OBSERVED).any(0)
     filled = replace(
         recording,
         markers=np.where(begun[:, None, None], markers, np.nan),
         angles=None if angles is None else np.where(begun[:, None], angles, np.nan),
         joints=None,
-        filled=recording.names,
+        filled=tuple(np.array(recording.names)[some].tolist()),
     )
     expected_error = np.where(begun[:, None], of("expected_error"), 0)
     return Tracked(filled, status, expected_error, state, of("notice"))

@@ -14,8 +14,10 @@ import pytest
 
 import numpy_infer.cli
 from numpy_infer import load_hand
-from numpy_infer.cli import check_output, main
-from numpy_infer.recordings import Recording, write
+from numpy_infer.cli import _summary, check_output, main
+from numpy_infer.hand import ANGLES
+from numpy_infer.recordings import Recording, read, write
+from numpy_infer.tracking import Tracked
 
 HAND = load_hand("glove9")
 
@@ -135,3 +137,64 @@ def test_a_prefix_that_no_label_has_is_named(
     assert "no label begins with 'R_'; there are" in refused(
         ["track", take, *out, *model, *both], capsys
     )
+
+
+def test_what_was_measured_stays_if_it_is_asked_for(take: str, tmp_path: Path) -> None:
+    """Also where a marker comes back, to which the output would lead it."""
+    recording = read(take)
+    markers = recording.markers + 1e-3 * np.random.default_rng(0).normal(size=(30, 1, 3))
+    markers[10:20, 3] = np.nan
+    markers[20:, 3] += 5e-3
+    write(replace(recording, markers=markers), tmp_path / "gap.csv")
+    seen = np.isfinite(markers)
+    for option, same in ((["--as-measured"], True), ([], False)):
+        assert main(["track", "gap.csv", "-o", "out.csv", "--overwrite", *option]) == 0
+        found = read("out.csv").markers
+        assert np.isfinite(found).all()
+        assert np.allclose(found[seen], markers[seen], rtol=0, atol=2e-6) == same
+
+
+def test_only_what_has_been_filled_is_said_to_be(take: str, tmp_path: Path) -> None:
+    recording = read(take)
+    markers = recording.markers.copy()
+    markers[10:20, 3] = np.nan
+    write(replace(recording, markers=markers), tmp_path / "gap.csv")
+    assert main(["track", "gap.csv", "-o", "out.tsv"]) == 0
+    assert read("out.tsv").filled == (HAND.markers[3],)
+
+
+def test_fingers_bent_backwards_are_told_of(capsys: pytest.CaptureFixture[str]) -> None:
+    recording = Recording(HAND.markers, np.zeros((4, 9, 3)), np.arange(4) / 60, 60.0, source="")
+    for degrees, told in ((-45, True), (10, False)):
+        angles = np.zeros((4, len(ANGLES)))
+        angles[:, [a.name.endswith("mcp_flexion") for a in ANGLES]] = np.radians(degrees)
+        nothing = np.zeros((4, 9))
+        result = Tracked(
+            replace(recording, angles=angles),
+            nothing,
+            nothing,
+            nothing[:, 0],
+            nothing[:, 0].astype(int),
+        )
+        assert ("bent backwards" in _summary(result)) == told
+    assert "no joint angles" in _summary(replace(result, recording=recording))
+
+
+def test_a_name_that_says_right_is_heard(take: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path(take).rename("a_right.csv")
+    assert main(["track", "a_right.csv", "-o", "out.csv"]) == 0
+    assert "name says right" in capsys.readouterr().out
+    assert main(["track", "a_right.csv", "-o", "other.csv", "--right"]) == 0
+    assert "name says right" not in capsys.readouterr().out
+
+
+def test_what_is_nearly_a_hand_is_told_what_it_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    a_recording(tmp_path / "eight.csv", names=HAND.markers[:-1])
+    assert main(["track", "eight.csv", "-o", "out.csv"]) == 2
+    assert f"glove9 lacks {HAND.markers[-1]}: an empty column would do" in capsys.readouterr().err
+    a_recording(tmp_path / "left.csv", prefix="L_")
+    assert main(["track", "left.csv", "-o", "out.csv"]) == 2
+    assert "--left-prefix" in capsys.readouterr().err

@@ -254,8 +254,8 @@ def test_the_command_smooths_and_says_how_late(
         out = str(tmp_path / f"{name}.csv")
         assert main(["track", str(tmp_path / "a.csv"), "-o", out, *more]) == 0
     said = capsys.readouterr().out
-    assert "smoothed: 80 ms late at rest, 7 ms at 1 m/s" in said
-    assert "smoothed: 318 ms late at rest, 8 ms at 1 m/s" in said
+    assert "smoothed: 80 ms late at rest, 7 ms at a steady 1 m/s" in said
+    assert "smoothed: 318 ms late at rest, 8 ms at a steady 1 m/s" in said
     raw, smooth, slow = (
         jitter(read(tmp_path / f"{name}.csv").markers) for name in ("raw", "smooth", "slow")
     )

@@ -144,7 +144,7 @@ def _check_fields(
     owners = _owners(columns, fields[0])
     expected = {*alone, *(f"{owner}.{field}" for owner in owners for field in fields)}
     unknown = [column for column in columns if column not in expected]
-    missing = [column for column in expected if column not in columns]
+    missing = sorted(column for column in expected if column not in columns)
     if unknown or missing or not owners:
         raise file.error(
             0,

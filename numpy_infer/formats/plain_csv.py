@@ -100,7 +100,11 @@ def _columns(
 ) -> tuple[tuple[str, ...], np.ndarray, tuple[str, ...]]:
     """Marker names, the [M, 3] columns of their coordinates, and notes about skipped columns."""
     if cells[0] != "time":
-        raise file.error(header, f"expected the first column to be time, found {cells[0]!r}")
+        raise file.error(
+            header,
+            f"expected the first column to be time, found {cells[0]!r}; the header is "
+            "time,NAME.x,NAME.y,NAME.z,… for all markers",
+        )
     place = {cell: index for index, cell in enumerate(cells)}
     angles = [cell for cell in cells if cell.endswith(".deg")]
     coordinates = [cell for cell in cells[1:] if not cell.endswith(".deg")]
