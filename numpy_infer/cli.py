@@ -325,9 +325,10 @@ def _summary(result: Tracked) -> str:
         error = 1e3 * result.expected_error[hidden].mean()
         lines.append(f"filled markers are expected to be {error:.0f} mm off on average")
     angles = result.recording.angles
+    tracking = state == TrackingState.TRACKING
     if angles is None:
         lines.append("no joint angles: the model has no joint network, or is not to use it")
-    elif np.nanmedian(np.degrees(angles[:, _KNUCKLES])) < BENT_BACK:
+    elif tracking.any() and np.median(np.degrees(angles[tracking][:, _KNUCKLES])) < BENT_BACK:
         lines.append(
             "the fingers look bent backwards at the knuckles: is it a right hand (--right), and do "
             "the markers sit where the model has them (jaxhand hand)?"

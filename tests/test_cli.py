@@ -16,6 +16,7 @@ import numpy_infer.cli
 from numpy_infer import load_hand
 from numpy_infer.cli import _summary, check_output, main
 from numpy_infer.hand import ANGLES
+from numpy_infer.pose import TrackingState
 from numpy_infer.recordings import Recording, read, write
 from numpy_infer.tracking import Tracked
 
@@ -177,6 +178,9 @@ def test_fingers_bent_backwards_are_told_of(capsys: pytest.CaptureFixture[str]) 
             nothing[:, 0].astype(int),
         )
         assert ("bent backwards" in _summary(result)) == told
+    never = replace(recording, angles=np.full((4, len(ANGLES)), np.nan))
+    lost = nothing[:, 0] + TrackingState.LOST
+    assert "bent" not in _summary(replace(result, recording=never, state=lost))
     assert "no joint angles" in _summary(replace(result, recording=recording))
 
 
