@@ -456,7 +456,9 @@ def train(config: TrainingConfig) -> Model:
         given.start,
     )
     if model.training["interrupted"]:
-        console.print("interrupted: the best weights so far are kept; --resume goes on")
+        begun = model.joints == "learned" or not config.joints
+        kept = "the best weights so far are kept" + ("" if begun else ", the joints have none yet")
+        console.print(f"interrupted: {kept}; --resume goes on")
     model = replace(model, training={**model.training, "config": _plain(config)})
     try:
         model = finish(model, given.sequences, console.print)

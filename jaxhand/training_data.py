@@ -60,7 +60,13 @@ def collect(config: TrainingConfig) -> Given:
         weight = sum(spec.weight for spec in specs if spec.name == SIMULATED)
         simulated, measured = weight * len(made[0].markers), _weight(training, recorded)
         training = training._replace(simulated=simulated / (simulated + measured))
-    joint_frames, notes = None, []
+    joint_frames, notes = (
+        None,
+        [
+            f"{own.name}: {_takes(own)} to train, {_takes(other)} to validate"
+            for own, other in zip(recorded, held_out, strict=True)
+        ],
+    )
     if config.joints and (training.angles is None or validation.angles is None):
         joint_frames = made if start is None or start.joint_network is None else None
         does = "stays as it is" if joint_frames is None else f"learns simulated {hand.name} hands"
@@ -71,6 +77,17 @@ def collect(config: TrainingConfig) -> Given:
         key = jax.random.key(config.seed)
         sequences = simulation.sequences(key, hand, PEOPLE, SECONDS)
     return Given(hand, training, validation, joint_frames, sequences, start, tuple(notes))
+
+
+MOST_NAMED = 6
+"""Takes: of more the number is said, not the names."""
+
+
+def _takes(dataset: Dataset) -> str:
+    names = sorted({sequence.take for sequence in dataset.sequences})
+    seconds = sum(len(sequence.markers) / sequence.rate for sequence in dataset.sequences)
+    said = ", ".join(names) if len(names) <= MOST_NAMED else f"{len(names)} takes"
+    return f"{said} ({seconds:.0f} s)"
 
 
 def simulated_frames(hand: Hand, seed: int) -> tuple[Frames, Frames]:
