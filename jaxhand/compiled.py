@@ -21,8 +21,8 @@ def apart(values: Any) -> Any:
 
 
 def compiled(function: Callable[..., Any], **options: Any) -> Callable[..., Any]:
-    """`jax.jit` that keeps what is `apart`, for whatever calls trackers or the simulator; two
-    thirds of the time and less. Not within another `jit`: on the CPU JAX refuses that.
+    """`jax.jit` that keeps what is `apart`, for whatever calls trackers or the simulator: a
+    tenth to a third less time. Not within another `jit`: on the CPU JAX refuses that.
 
     Args:
         function: as `jax.jit` takes it.

@@ -26,6 +26,9 @@ POSTURES, PEOPLE, SECONDS = 20_000, 16, 10
 """Simulated frames of an epoch, a tenth of it to validate on; people who move to choose on what
 depends on motion, and for how long."""
 
+MOST_NAMED = 6
+"""Takes: of more the number is said, not the names."""
+
 
 class Given(NamedTuple):
     """All that a training needs to be given."""
@@ -77,10 +80,6 @@ def collect(config: TrainingConfig) -> Given:
         key = jax.random.key(config.seed)
         sequences = simulation.sequences(key, hand, PEOPLE, SECONDS)
     return Given(hand, training, validation, joint_frames, sequences, start, tuple(notes))
-
-
-MOST_NAMED = 6
-"""Takes: of more the number is said, not the names."""
 
 
 def _takes(dataset: Dataset) -> str:

@@ -24,6 +24,10 @@ from numpy_infer.predictors import BASELINES, PREDICTORS
 from numpy_infer.recordings import Recording, load_label_map, read, write, writer_of
 from numpy_infer.tracking import Tracked, as_measured, prefixed, track, track_hands
 
+BENT_BACK = -25.0
+"""Degrees: fingers whose knuckles are flexed less, half of the time, are somebody else's."""
+_KNUCKLES = [i for i, a in enumerate(ANGLES) if a.name.endswith("mcp_flexion")][1:]  # no thumb
+
 VERBS = {
     "train": "train both networks on recordings of hands",
     "evaluate": "measure a model beside the baselines (the paper's Table 3)",
@@ -299,11 +303,6 @@ def _outputs(options: argparse.Namespace) -> dict[str, Path]:
     if options.right and options.left_prefix:
         raise ValueError("--right goes with --right-prefix, not with --left-prefix")
     return {"right" if options.right or options.right_prefix else "left": out}
-
-
-BENT_BACK = -25.0
-"""Degrees: fingers whose knuckles are flexed less, half of the time, are somebody else's."""
-_KNUCKLES = [i for i, a in enumerate(ANGLES) if a.name.endswith("mcp_flexion") and i > 5]
 
 
 def _summary(result: Tracked) -> str:

@@ -167,7 +167,7 @@ def _steady(
     )
     if direct and np.count_nonzero(state.correction):
         direct = not np.count_nonzero(state.correction[..., hand.aligned, :])
-    advance, registered, raw, exact = fill(
+    advance, registered, raw, exact = _fill(
         model,
         state.predictor,
         registered,
@@ -252,17 +252,17 @@ def _unsteady(
     measured = untransform(rotations, translations, np.stack([markers, previous]))
     if PREDICTORS[model.predictor].of_frame is not None:
         # Both frames in one product per layer of the network.
-        advance, both, raw, exact = fill(
+        advance, both, raw, exact = _fill(
             model, state.predictor, measured, markers, visible, last, dt, now, now
         )
         registered, again = both
     else:
         earlier = _registration_before(state, then, changed, now)
-        advance, registered, raw, exact = fill(
+        advance, registered, raw, exact = _fill(
             model, state.predictor, measured[0], markers, visible, last, dt, now, earlier
         )
         still = np.zeros_like(dt)
-        _, again, *_ = fill(
+        _, again, *_ = _fill(
             model, state.predictor, measured[1], previous, visible, last, still, then, then
         )
     correction = untransform(*then, last) - again
@@ -310,7 +310,7 @@ def _carried_prior(state: State, markers: Array, weight: Array) -> Array:
     return kabsch(state.anchor, markers, weight, state.rotation)[0] @ state.prior
 
 
-def fill(
+def _fill(
     model: Model,
     predictor: Any,
     registered: Array,

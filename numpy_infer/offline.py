@@ -21,12 +21,12 @@ from numpy_infer.continuity import (
     blended,
     choose,
     each,
-    fill,
     posture_change,
 )
 from numpy_infer.geometry import PRIOR_STRENGTH, fit, kabsch, pattern, transform, untransform
 from numpy_infer.model import Model
 from numpy_infer.pose import State
+from numpy_infer.predictors import PREDICTORS
 
 
 def together(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State | None:
@@ -44,13 +44,10 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         return None
     rotation, translation = registration
     registered = untransform(rotation, translation, markers)
-    predictor, registered, raw, exact = fill(
-        *(model, state.predictor, registered, markers, visible, markers, dt),
-        *((rotation, translation), (rotation, translation)),
-    )
+    registered = _filled(model, registered, visible)
     state = each(lambda leaf: leaf[None], state)
     frames = Frame(
-        predictor,
+        state.predictor,
         state.tracking,
         rotation,
         translation,
@@ -60,8 +57,8 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         state.prior,
         state.drift,
         registered,
-        raw,
-        exact,
+        markers,
+        visible,
         None,
     )
     elapsed = np.cumsum(dt, 0)
@@ -79,6 +76,14 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         )
     state = state._replace(known=state.known | np.logical_or.accumulate(visible, 0))
     return blended(model, state, frames, markers, visible, weight, elapsed)
+
+
+def _filled(model: Model, registered: Array, visible: Array) -> Array:
+    """Markers `[..., M, 3]` of the registered frame, with what is said of those that are hidden."""
+    of_frame = PREDICTORS[model.predictor].of_frame
+    if of_frame is None or visible.all():
+        return registered
+    return np.where(visible[..., None], registered, of_frame(model, registered, visible))
 
 
 class _Changes(NamedTuple):
@@ -120,9 +125,7 @@ def _changes(
     template = model.hand.template.astype(markers.dtype, copy=False)
     then = kabsch(template, previous, seen.astype(markers.dtype), followed)
     anchor = untransform(*then, previous)
-    _, again, *_ = fill(
-        *(model, frames.predictor, anchor, previous, seen, previous, both[..., 0], then, then)
-    )
+    again = _filled(model, anchor, seen)
     now = frames.rotation[at], frames.translation[at]
     origin = untransform(*now, transform(turn, move, translation[..., None, :]))
     back = now[0].swapaxes(-1, -2)
@@ -172,8 +175,13 @@ def _chained(
                 seen = np.where(visible[last][..., None], frames.registered[last], seen)
             if begin and model.continuity:
                 correction, added = blend(
-                    *(model, correction, frames.tracking[0], change[last]),
-                    *(visible[last], weight[last], elapsed[last]),
+                    model,
+                    correction,
+                    frames.tracking[0],
+                    change[last],
+                    visible[last],
+                    weight[last],
+                    elapsed[last],
                 )
                 missing = missing + added @ changes.turn[k - 1]
             far = np.sqrt((missing * missing).sum(-1, keepdims=True))

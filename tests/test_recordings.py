@@ -356,6 +356,13 @@ def test_a_missing_file_is_a_missing_file(tmp_path: Path, c3d_declared: None) ->
             read(tmp_path / f"none{suffix}", unit=1e-3)
 
 
+def test_rounded_times_give_the_rate_that_they_were_rounded_from() -> None:
+    time = np.round(np.arange(500) / 120, 4)
+    assert median_rate(time, "x") == pytest.approx(120, abs=0.01)
+    # Where frames are lost the steps are not alike, and a mean would be too low.
+    assert median_rate(np.delete(time, slice(100, 200)), "x") > 119
+
+
 def test_the_rate_is_the_median_over_steps_that_advance() -> None:
     time = np.array([0.0, 0.01, 0.02, 0.02, 0.03, 5.0, 5.01])
     assert median_rate(time, "x") == pytest.approx(100)
