@@ -24,7 +24,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", nargs="+", help="NAME:PATH, see jaxhand train")
     parser.add_argument("--out", type=Path, default=Path("runs/no_data"), help="of the run folders")
-    parser.add_argument("--rate", type=float, default=3e-4, help="learning rate of the refinement")
     parser.add_argument("--epochs", type=int, default=300, help="at most")
     parser.add_argument("--seeds", type=int, default=2)
     options = parser.parse_args()
@@ -35,9 +34,7 @@ def main() -> None:
         own = TrainingConfig(
             (data,), options.out / name, joints=False, epochs=options.epochs, overwrite=True
         )
-        refined = replace(
-            own, out=options.out / f"{name}_refined", start=bundled, learning_rate=options.rate
-        )
+        refined = replace(own, out=options.out / f"{name}_refined", start=bundled)
         rows = {
             "affine": Model(test.hand, predictor="affine"),
             "simulated": replace(models.load(bundled), joints="none"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +20,11 @@ from numpy_infer.networks import Network
 FADES = (0.01, 0.02, 0.03, 0.04, 0.06, 0.1)
 """Metres: values of δ that are tried on validation."""
 
+SHARES = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95, 1.0)
+"""Parts of the way from the network that was refined to what it became, that are tried on
+validation (Wortsman et al. 2022, Robust fine-tuning of zero-shot models): weights somewhat short of
+the end are better for people that were not in the data."""
+
 PARITY = 1e-4
 """Largest difference between JAX and numpy outputs, relative to the spread of the outputs: what
 float32 leaves after four layers, with room."""
@@ -29,9 +34,18 @@ def finish(
     model: Model,
     sequences: Sequence[MarkerSequence],
     report: Callable[[str], None] = lambda text: None,
+    start: Model | None = None,
 ) -> Model:
     """Chooses δ of the continuity blend and measures what error to expect, both on validation
-    sequences. A model without a marker network, or sequences too short, stay as is."""
+    sequences. A model without a marker network, or sequences too short, stay as is.
+
+    Args:
+        model: as trained.
+        sequences: of validation.
+        report: is told what was chosen.
+        start: the model that the training went on from; how much of what it learned is kept is
+            then chosen first.
+    """
     if model.marker_network is None:
         return model
     try:
@@ -39,18 +53,45 @@ def finish(
     except ValueError as error:
         report(f"fade and expected error keep their defaults: {error}")
         return model
-    learned = replace(model, predictor="learned", joints="none")
-    means = {
-        fade: _mean(evaluation.table3({"": replace(learned, fade=fade)}, sequences, seeds=1)[""])
-        for fade in FADES
+    if start is not None and start.marker_network is not None:
+        between = {share: _between(start.marker_network, model, share) for share in SHARES}
+        share = _best("{:.0%} of what was learned", between, sequences, report)
+        model = replace(between[share], training={**model.training, "kept": share})
+    faded = {fade: replace(model, fade=fade) for fade in FADES}
+    fade = _best("fade δ = {:.3f} m", faded, sequences, report)
+    return with_expected_error(faded[fade], sequences, report)
+
+
+def _best(
+    words: str,
+    models: Mapping[float, Model],
+    sequences: Sequence[MarkerSequence],
+    report: Callable[[str], None],
+) -> float:
+    """The key of the model whose mean over Table 3 is least; `words` say what a key is."""
+    errors = {}
+    for key, model in models.items():
+        errors[key] = _error(model, sequences)
+        report(f"{words.format(key)}: {errors[key]:.3f} cm on validation")
+    best = min(errors, key=errors.__getitem__)
+    report(f"{words.format(best)} is taken")
+    return best
+
+
+def _between(start: Network, model: Model, share: float) -> Model:
+    """The model with the marker network so far on its way from `start`; both scale alike."""
+    network: Network = model.marker_network  # type: ignore[assignment]
+    arrays = {
+        name: (1 - share) * before + share * network.arrays[name]
+        for name, before in start.arrays.items()
     }
-    fade = min(FADES, key=means.__getitem__)
-    report(f"fade δ = {1e3 * fade:.0f} mm")
-    return with_expected_error(replace(model, fade=fade), sequences, report)
+    return replace(model, marker_network=replace(network, arrays=arrays))
 
 
-def _mean(table: dict[str, dict[str, evaluation.Cell]]) -> float:
-    """cm, over all cells with a trial."""
+def _error(model: Model, sequences: Sequence[MarkerSequence]) -> float:
+    """cm, over all cells of Table 3 with a trial."""
+    learned = replace(model, predictor="learned", joints="none")
+    table = evaluation.table3({"": learned}, sequences, seeds=1)[""]
     cells = [cell["mean"] for row in table.values() for cell in row.values()]
     return float(np.mean([mean for mean in cells if mean is not None]))
 

@@ -26,6 +26,7 @@ from numpy_infer.arrays import Array
 from numpy_infer.hand import CHAINS, Hand, bundled, load_hand
 from numpy_infer.model import Model
 from numpy_infer.pose import HandPose
+from numpy_infer.wearer import worn_by
 
 POINTS = np.array(JOINT_POINTS)
 
@@ -69,7 +70,8 @@ def rows(
         others: further models by the name of their row.
     """
     wearer = dataset.hand
-    learned = replace(model, predictor="learned", joints="learned", alignment=True)
+    uncalibrated = replace(model, predictor="learned", joints="learned", alignment=True)
+    learned = worn_by(uncalibrated, wearer)
     filled = replace(learned, joints="none")
     found = {
         "ik": Row(filled, partial(_descend, wearer, tuned=False)),
@@ -79,14 +81,13 @@ def rows(
     if posture is not None:
         prior = PosePrior(*(np.array(posture[name], np.float32) for name in PosePrior._fields))
         found["least_squares"] = Row(filled, partial(_fit, wearer, prior))
-    found["learned"] = Row(replace(learned, wearer=wearer))
-    unaligned = replace(learned, alignment=False, wearer=wearer)
-    found["learned_unaligned"] = Row(unaligned, hides=False)
+    found["learned"] = Row(learned)
+    found["learned_unaligned"] = Row(replace(learned, alignment=False), hides=False)
     if model.hand.name in bundled():
         average = model.hand.with_skeleton(load_hand(model.hand.name).skeleton)
-        found["learned_uncalibrated"] = Row(replace(learned, wearer=average))
+        found["learned_uncalibrated"] = Row(replace(uncalibrated, wearer=average))
     for name, other in (others or {}).items():
-        found[name] = Row(replace(other, alignment=True, wearer=wearer))
+        found[name] = Row(worn_by(replace(other, alignment=True), wearer))
     return found
 
 

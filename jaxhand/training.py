@@ -461,7 +461,7 @@ def train(config: TrainingConfig) -> Model:
         console.print(f"interrupted: {kept}; --resume goes on")
     model = replace(model, training={**model.training, "config": _plain(config)})
     try:
-        model = finish(model, given.sequences, console.print)
+        model = finish(model, given.sequences, console.print, given.start)
     except KeyboardInterrupt:
         console.print("interrupted: fade and expected error keep their defaults")
     model = export(model, config.out / "model.npz", overwrite=True)

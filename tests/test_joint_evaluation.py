@@ -49,7 +49,10 @@ def test_rows_stand_on_the_data_sets_bones_but_the_uncalibrated_one(dataset: Dat
         *("learned", "learned_unaligned", "learned_uncalibrated", "learned_paper"),
     ]
     for name, row in rows.items():
-        bones = GLOVE.skeleton if name == "learned_uncalibrated" else dataset.hand.skeleton
+        calibrated = name != "learned_uncalibrated"
+        bones = dataset.hand.skeleton if calibrated else GLOVE.skeleton
+        # In the size that they know: what the networks take for their own hand has the person's.
+        assert row.model.hand.size == pytest.approx((LARGER if calibrated else 1) * GLOVE.size)
         if row.solve is None:
             np.testing.assert_array_equal(row.model.body.skeleton, bones)
             assert row.model.alignment == (name != "learned_unaligned")
