@@ -406,6 +406,20 @@ def test_a_used_folder_is_refused_unless_told_what_to_do(tmp_path: Path) -> None
         runs.check(tmp_path, plain(resume=True))
 
 
+def test_only_a_run_that_is_there_is_gone_on_with(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").touch()
+    for name, message in (
+        ("rnus", r"rnus does not exist, so there is no run to resume: leave out --resume"),
+        ("empty", r"empty is empty, so there is no run to resume"),
+        ("file", r"out: expected a folder"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            runs.check(tmp_path / name, plain(resume=True))
+    for name in ("rnus", "empty"):
+        runs.check(tmp_path / name, plain())
+
+
 def test_overwriting_removes_a_runs_own_files_only(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     (tmp_path / "metrics.jsonl").write_text("{}\n")
