@@ -87,7 +87,9 @@ def parser() -> argparse.ArgumentParser:
         "track",
         help="fill the holes of a recording, and solve the joints",
         description="Runs the tracker over a recording and writes all markers; a .csv also holds "
-        "the joint angles. Example: jaxhand track take.trc --model model.npz -o filled.csv",
+        "the joint angles and, of each marker, what it rests on (NAME.status, numbers as its first "
+        "lines say) and the metres that it is expected to be off (NAME.expected_error). "
+        "Example: jaxhand track take.trc --model model.npz -o filled.csv",
     )
     _add_file(tracked)
     tracked.add_argument(
@@ -205,7 +207,7 @@ def _inspect(options: argparse.Namespace) -> None:
     width = max(len(name) for name in recording.names)
     print(f"\n{'marker':{width}}  missing  gaps  longest")
     for name, marker in report["markers"].items():
-        mark = "  partly filled in by the recording software" if marker["filled"] else ""
+        mark = "  partly filled in, not measured" if marker["filled"] else ""
         print(
             f"{name:{width}}  {100 * marker['missing']:6.1f}%  {marker['gaps']:4d}  "
             f"{marker['longest_s']:6.2f}s{mark}"

@@ -26,15 +26,22 @@ class Tracked:
 
     recording: Recording
     """Markers `[T, M, 3]` metres and, with a joint stage, angles `[T, 26]` radians; NaN before the
-    hand was first tracked, and with the predictor `none` wherever nothing was measured."""
-    status: Array
-    """`[T, M]` a `Status` for each marker."""
-    expected_error: Array
-    """`[T, M]` metres."""
+    hand was first tracked, and with the predictor `none` wherever nothing was measured. Of every
+    marker its status and expected error."""
     state: Array
     """`[T]` a `TrackingState` for each frame."""
     notice: Array
     """`[T]` flags of `Notice`."""
+
+    @property
+    def status(self) -> Array:
+        """`[T, M]` a `Status` for each marker."""
+        return self.recording.status
+
+    @property
+    def expected_error(self) -> Array:
+        """`[T, M]` metres."""
+        return self.recording.expected_error
 
 
 def track(
@@ -135,7 +142,8 @@ def _tracked(recording: Recording, model: Model, poses: Sequence[HandPose]) -> T
         markers=np.where(begun[:, None, None], markers, np.nan),
         angles=None if angles is None else np.where(begun[:, None], angles, np.nan),
         joints=None,
+        status=status,
+        expected_error=np.where(begun[:, None], of("expected_error"), 0),
         filled=tuple(np.array(recording.names)[some].tolist()),
     )
-    expected_error = np.where(begun[:, None], of("expected_error"), 0)
-    return Tracked(filled, status, expected_error, state, of("notice"))
+    return Tracked(filled, state, of("notice"))

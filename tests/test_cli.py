@@ -16,9 +16,10 @@ import numpy_infer.cli
 from numpy_infer import load_hand
 from numpy_infer.cli import _summary, check_output, main
 from numpy_infer.hand import ANGLES
+from numpy_infer.model import load
 from numpy_infer.pose import TrackingState
 from numpy_infer.recordings import Recording, read, write
-from numpy_infer.tracking import Tracked
+from numpy_infer.tracking import Tracked, track
 
 HAND = load_hand("glove9")
 
@@ -164,19 +165,37 @@ def test_only_what_has_been_filled_is_said_to_be(take: str, tmp_path: Path) -> N
     assert read("out.tsv").filled == (HAND.markers[3],)
 
 
+def test_a_filled_table_says_what_was_measured_and_how_far_off_the_rest_may_be(
+    take: str, tmp_path: Path
+) -> None:
+    """As the tracker says it live, `--as-measured` or not."""
+    recording = read(take)
+    markers = recording.markers.copy()
+    markers[:5] = markers[10:20, 3] = markers[15:, 7] = np.nan
+    write(replace(recording, markers=markers), tmp_path / "gap.csv")
+    result = track(read("gap.csv"), load("glove9"))
+    for option in ([], ["--as-measured"]):
+        assert main(["track", "gap.csv", "-o", "out.csv", "--overwrite", *option]) == 0
+        lines = Path("out.csv").read_text().splitlines()
+        header, *rows = (line.split(",") for line in lines if not line.startswith("#"))
+        for kind, wanted in (("status", result.status), ("expected_error", result.expected_error)):
+            columns = [header.index(f"{name}.{kind}") for name in HAND.markers]
+            told = np.array([[float(row[i] or "nan") for i in columns] for row in rows])
+            np.testing.assert_allclose(told[5:], wanted[5:], rtol=0, atol=1e-6)
+            assert told[5:].any()
+        assert np.isnan(told[:5]).all(), "no error is known of what is blank"
+        assert read("out.csv").names == HAND.markers
+
+
 def test_fingers_bent_backwards_are_told_of(capsys: pytest.CaptureFixture[str]) -> None:
     recording = Recording(HAND.markers, np.zeros((4, 9, 3)), np.arange(4) / 60, 60.0, source="")
     for degrees, told in ((-45, True), (10, False)):
         angles = np.zeros((4, len(ANGLES)))
         angles[:, [a.name.endswith("mcp_flexion") for a in ANGLES]] = np.radians(degrees)
         nothing = np.zeros((4, 9))
-        result = Tracked(
-            replace(recording, angles=angles),
-            nothing,
-            nothing,
-            nothing[:, 0],
-            nothing[:, 0].astype(int),
-        )
+        recording = replace(recording, status=nothing, expected_error=nothing)
+        notice = nothing[:, 0].astype(int)
+        result = Tracked(replace(recording, angles=angles), nothing[:, 0], notice)
         assert ("bent backwards" in _summary(result)) == told
     never = replace(recording, angles=np.full((4, len(ANGLES)), np.nan))
     lost = nothing[:, 0] + TrackingState.LOST
