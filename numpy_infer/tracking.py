@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from numpy_infer.arrays import Array
-from numpy_infer.hand import Hand
 from numpy_infer.model import Model
 from numpy_infer.pose import HandPose, Status, TrackingState
 from numpy_infer.recordings import Recording
@@ -114,17 +113,6 @@ def as_measured(result: Tracked, recording: Recording) -> Tracked:
 
 def _part(report: Callable[[float], None], number: int, of: int, share: float) -> None:
     report((number + share) / of)
-
-
-def prefixed(recording: Recording, prefix: str, hand: Hand) -> Recording:
-    """The markers of one hand whose labels all begin with `prefix`, under the hand's own names.
-
-    Raises:
-        ValueError: one of them is not in the recording.
-    """
-    own = recording.select([prefix + name for name in hand.markers])
-    filled = tuple(name.removeprefix(prefix) for name in own.filled)
-    return replace(own, names=hand.markers, filled=filled)
 
 
 def _tracked(recording: Recording, model: Model, poses: Sequence[HandPose]) -> Tracked:
