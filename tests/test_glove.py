@@ -17,6 +17,7 @@ from simulated import motion, worn
 
 from jaxhand import cli, glove
 from jaxhand.calibration import Calibration
+from jaxhand.datasets import SIG18_AS_GLOVE9
 from numpy_infer import HandTracker, load_hand, model, wearer
 from numpy_infer.geometry import mirror
 from numpy_infer.hand import POINTS
@@ -129,6 +130,25 @@ def test_a_fit_that_is_none_is_told_of(
         if side is not None:
             assert ("hand they fit better" in printed) == bool(side)
             assert not side or f"as a {side} hand they fit better" in printed
+
+
+@pytest.mark.parametrize("user", ["User1", "User2", "User3"])
+def test_a_recorded_hand_is_of_its_own_side(
+    user: str, data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of its markers the nine of the bundled model, which has never seen a recorded hand."""
+    (folder, *_) = sorted((data_root / "sig18" / user).iterdir())
+    takes = [read(path) for path in sorted(folder.glob("*_left.trc"))]
+    markers = np.concatenate([take.rename(SIG18_AS_GLOVE9).markers for take in takes])
+    names = takes[0].rename(SIG18_AS_GLOVE9).names
+    time = np.arange(len(markers)) / takes[0].rate
+    write(Recording(names, markers, time, takes[0].rate, source=""), tmp_path / "left.trc")
+    for right in ([], ["--right"]):
+        out = ["-o", str(tmp_path / "me.json"), "--overwrite"]
+        assert cli.calibrate([str(tmp_path / "left.trc"), "--model", "glove9", *out, *right]) == 0
+        printed = capsys.readouterr().out
+        assert ("as a left hand they fit better" in printed) == bool(right)
+        assert "a poor fit" not in printed or right
 
 
 @pytest.mark.parametrize(

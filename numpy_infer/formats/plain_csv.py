@@ -46,7 +46,11 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     scale = agreed(path, stated, unit)
     cells = file.unique(header, file.cells(header, ","), "column")
     names, columns, notes = _columns(file, header, cells)
-    status = {name: cells.index(f"{name}.status") for name in names if f"{name}.status" in cells}
+    status = {
+        cell.removesuffix(".status"): [i]
+        for i, cell in enumerate(cells)
+        if cell.endswith(".status")
+    }
     table = file.numbers(header + 1, len(cells), ",")
     time = table[:, 0]
     file.check_time(time, header + 1)
@@ -64,7 +68,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         rate=rate,
         source=str(path),
         unit=scale,
-        filled=tuple(name for name, column in status.items() if (table[:, column] > 0).any()),
+        filled=tuple(name for name in names if (table[:, status.get(name, [])] > 0).any()),
         notes=file.notes + notes,
     )
     return recording.reflected() if left_handed else recording
