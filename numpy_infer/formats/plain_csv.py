@@ -47,9 +47,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     cells = file.unique(header, file.cells(header, ","), "column")
     names, columns, notes = _columns(file, header, cells)
     status = {
-        cell.removesuffix(".status"): [i]
-        for i, cell in enumerate(cells)
-        if cell.endswith(".status")
+        cell.removesuffix(".status"): i for i, cell in enumerate(cells) if cell.endswith(".status")
     }
     table = file.numbers(header + 1, len(cells), ",")
     time = table[:, 0]
@@ -68,7 +66,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         rate=rate,
         source=str(path),
         unit=scale,
-        filled=tuple(name for name in names if (table[:, status.get(name, [])] > 0).any()),
+        filled=tuple(n for n in names if n in status and (table[:, status[n]] > 0).any()),
         notes=file.notes + notes,
     )
     return recording.reflected() if left_handed else recording
