@@ -19,7 +19,6 @@ from jaxhand import datasets, simulation
 from jaxhand.expected_error import Samples, measure
 from jaxhand.export import with_expected_error
 from jaxhand.sequences import Sequence as MarkerSequence
-from jaxhand.training_data import SIMULATED
 from numpy_infer.hand import Hand
 from numpy_infer.model import load
 
@@ -32,7 +31,7 @@ FEWEST, WITHIN = 500, 0.15
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("model", help="a model file or a bundled model")
-    parser.add_argument("data", help=f"NAME:PATH, or the word {SIMULATED}")
+    parser.add_argument("data", help=f"NAME:PATH, or the word {datasets.SIMULATED}")
     parser.add_argument("--split", choices=("validation", "test"), default="test")
     parser.add_argument("--measured", action="store_true", help="measure on validation first")
     options = parser.parse_args()
@@ -44,7 +43,7 @@ def main() -> None:
 
 def takes(spec: str, split: datasets.Split, hand: Hand) -> Sequence[MarkerSequence]:
     """Of a data set; or of simulated people, other ones for the test."""
-    if spec == SIMULATED:
+    if spec == datasets.SIMULATED:
         return simulation.sequences(jax.random.key(1 if split == "validation" else 2), hand)
     return datasets.load(spec, split, hand=hand).sequences
 

@@ -44,6 +44,8 @@ from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations
 Split = Literal["train", "validation", "test"]
 OWN = "recordings"
 """The data set that is whoever's own files."""
+SIMULATED = "simulated"
+"""The name of what has no files: hands that are made while they are asked for."""
 MIN_FRAMES = 24
 """SIG18's shorter sequences are dropped."""
 OBSERVED = np.radians(10)

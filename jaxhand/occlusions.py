@@ -21,6 +21,8 @@ from rich.table import Table
 from jaxhand.anthropometry import people
 from jaxhand.cameras import Rig, film
 from jaxhand.compiled import compiled
+from jaxhand.datasets import SIMULATED
+from jaxhand.pictures import check_picture, occlusions_picture
 from jaxhand.two_hands import two_hands
 from numpy_infer.arrays import Array
 from numpy_infer.cli import check_output
@@ -36,10 +38,8 @@ FEWEST_LEFT = 3
 ONE, TWO = "one hand", "two hands"
 """Names of tables: of recordings with one hand, and with two."""
 
-SIMULATED = "simulated"
-"""Instead of a file: hands and cameras out of a random key."""
 RATE, RECORDINGS = 120.0, 8
-"""Frames per second of these, and their number."""
+"""Frames per second of simulated recordings, and their number."""
 
 
 @dataclass(frozen=True)
@@ -314,9 +314,10 @@ def occlusions(config: OcclusionsConfig, console: Console | None = None) -> dict
             fit no hand.
     """
     console = console or Console(soft_wrap=True, highlight=False)
-    for path in (config.json, config.picture):
-        if path is not None:
-            check_output(path, overwrite=config.overwrite)
+    if config.json is not None:
+        check_output(config.json, overwrite=config.overwrite)
+    if config.picture is not None:
+        check_picture(config.picture, overwrite=config.overwrite)
     if not config.files:
         raise ValueError(f"expected marker files, or the word {SIMULATED}")
     tables = _simulated(config) if config.files == (SIMULATED,) else _recorded(config, console)
@@ -325,8 +326,6 @@ def occlusions(config: OcclusionsConfig, console: Console | None = None) -> dict
         save(tables, config.json, overwrite=config.overwrite)
         console.print(f"wrote {config.json}")
     if config.picture is not None:
-        from jaxhand.pictures import occlusions_picture
-
         occlusions_picture(tables, config.picture, overwrite=config.overwrite)
         console.print(f"wrote {config.picture}")
     return tables

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from numpy_infer.arrays import Array
+from numpy_infer.cli import check_output
 from numpy_infer.geometry import untransform
 from numpy_infer.hand import CHAINS, JOINTS, Hand
 from numpy_infer.pose import HandPose
@@ -73,7 +74,7 @@ def table_picture(table: Mapping[str, Any], path: str | Path, *, overwrite: bool
         overwrite: replace the file if there is one.
 
     Raises:
-        ValueError: the file exists, or matplotlib is missing.
+        ValueError: as `check_picture`.
     """
     figure = _figure(path, overwrite, (12, 3.9))
     table = {method: _from_unhidden(rows) for method, rows in table.items()}
@@ -122,7 +123,7 @@ def stream_picture(
         overwrite: replace the file if there is one.
 
     Raises:
-        ValueError: the file exists, matplotlib is missing, or the output has no joints.
+        ValueError: the output has no joints, or as `check_picture`.
     """
     if poses.positions is None:
         raise ValueError("the picture shows joints, and the model has no joint stage")
@@ -166,7 +167,7 @@ def occlusions_picture(
         overwrite: replace the file if there is one.
 
     Raises:
-        ValueError: the file exists, or matplotlib is missing.
+        ValueError: as `check_picture`.
     """
     from jaxhand.occlusions import QUANTILES
 
@@ -190,13 +191,32 @@ def occlusions_picture(
     _save(figure, path)
 
 
-def _figure(path: str | Path, overwrite: bool, inches: tuple[float, float]) -> Any:
-    if Path(path).exists() and not overwrite:
-        raise ValueError(f"{path} exists: choose another name, or ask to overwrite it")
+def check_picture(path: str | Path, *, overwrite: bool) -> None:
+    """Refuses, before the work, a picture that could not be drawn after it.
+
+    Args:
+        path: the picture; its ending is the format.
+        overwrite: it may be there already.
+
+    Raises:
+        ValueError: matplotlib is missing or does not know the ending, or as `cli.check_output`.
+    """
+    path = Path(path)
     try:
         from matplotlib.figure import Figure
     except ImportError:
         raise ValueError("pictures need matplotlib: pip install 'jaxhand[plot]'") from None
+    known = Figure().canvas.get_supported_filetypes()
+    if path.suffix[1:].lower() not in known:
+        endings = ", ".join(f".{ending}" for ending in sorted(known))
+        raise ValueError(f"{path}: cannot draw {path.suffix!r}; known: {endings}")
+    check_output(path, overwrite=overwrite)
+
+
+def _figure(path: str | Path, overwrite: bool, inches: tuple[float, float]) -> Any:
+    check_picture(path, overwrite=overwrite)
+    from matplotlib.figure import Figure
+
     return Figure(figsize=inches, layout="constrained")
 
 

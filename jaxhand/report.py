@@ -19,6 +19,7 @@ from jaxhand.datasets import load
 from jaxhand.evaluation import COUNTS, DURATIONS, SEEDS, Report, mean_ratio, methods, table3
 from jaxhand.joint_evaluation import joint_errors
 from jaxhand.options import AlsoModels, DataSets, Takes
+from jaxhand.pictures import check_picture, table_picture
 from jaxhand.sequences import Dataset
 from numpy_infer.cli import check_output
 from numpy_infer.model import Model, bundled
@@ -75,9 +76,10 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
     console = console or Console()
     if config.seeds < 1:
         raise ValueError(f"seeds: expected 1 or more, found {config.seeds}")
-    for path in (config.json, config.plot):
-        if path is not None:
-            check_output(path, overwrite=config.overwrite)
+    if config.json is not None:
+        check_output(config.json, overwrite=config.overwrite)
+    if config.plot is not None:
+        check_picture(config.plot, overwrite=config.overwrite)
     if len(config.data) != 1:
         raise ValueError(f"expected one --data, found {len(config.data)}: each gets its own table")
     named = config.model is not None and config.model not in BASELINES
@@ -107,8 +109,6 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
         config.json.write_text(json.dumps(result, indent=1) + "\n", "utf-8")
         console.print(f"wrote {config.json}")
     if config.plot is not None:
-        from jaxhand.pictures import table_picture
-
         table_picture(result[f"table{config.table}"], config.plot, overwrite=config.overwrite)
         console.print(f"wrote {config.plot}")
     return result

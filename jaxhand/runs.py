@@ -24,10 +24,13 @@ def check(folder: Path, config: Mapping[str, Any]) -> None:
     Raises:
         ValueError: with what to pass instead.
     """
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return
-    if not folder.is_dir():
+    if folder.exists() and not folder.is_dir():
         raise ValueError(f"out: expected a folder, found the file {folder}")
+    if not folder.exists() or not any(folder.iterdir()):
+        if config["resume"]:
+            what = "is empty" if folder.exists() else "does not exist"
+            raise ValueError(f"{folder} {what}, so there is no run to resume: leave out --resume")
+        return
     if config["overwrite"]:
         return
     if not config["resume"]:

@@ -23,7 +23,7 @@ import optax
 from rich.console import Console
 
 from jaxhand import runs
-from jaxhand.datasets import OWN, parse_spec
+from jaxhand.datasets import OWN, SIMULATED, parse_spec
 from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
 from jaxhand.occlusions import Occlusions, of_layout
@@ -37,7 +37,7 @@ from jaxhand.tasks import (
     marker_task,
     mean_square,
 )
-from jaxhand.training_data import SIMULATED, check_frames, check_joint_frames, collect
+from jaxhand.training_data import check_frames, check_joint_frames, collect
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
 from numpy_infer.model import Model

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxhand import simulation
-from jaxhand.datasets import OWN, Split, load, parse_spec
+from jaxhand.datasets import OWN, SIMULATED, Split, load, parse_spec
 from jaxhand.occlusions import FEWEST_LEFT
 from jaxhand.sequences import Dataset, Sequence
 from jaxhand.tasks import Frames, complete
@@ -20,8 +20,6 @@ from numpy_infer.model import load as load_model
 if TYPE_CHECKING:
     from jaxhand.training import TrainingConfig
 
-SIMULATED = "simulated"
-"""The name of the data set that is made while it is trained on."""
 POSTURES, PEOPLE, SECONDS = 20_000, 16, 10
 """Simulated frames of an epoch, a tenth of it to validate on; people who move to choose on what
 depends on motion, and for how long."""

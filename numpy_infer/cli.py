@@ -16,13 +16,14 @@ import numpy as np
 
 from numpy_infer import wearer
 from numpy_infer.hand import ANGLES, Hand, bundled, load_hand
+from numpy_infer.labels import doubted_unit, fitting_hand, labels_of, lacking, prefixed, unfitting
 from numpy_infer.model import Model, load
 from numpy_infer.model import bundled as bundled_models
 from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import Notice, Status, TrackingState
 from numpy_infer.predictors import BASELINES, PREDICTORS
 from numpy_infer.recordings import Recording, load_label_map, read, write, writer_of
-from numpy_infer.tracking import Tracked, as_measured, prefixed, track, track_hands
+from numpy_infer.tracking import Tracked, as_measured, track, track_hands
 
 BENT_BACK = -25.0
 """Degrees: fingers whose knuckles are flexed less, half of the time, are somebody else's."""
@@ -87,7 +88,9 @@ def parser() -> argparse.ArgumentParser:
         "track",
         help="fill the holes of a recording, and solve the joints",
         description="Runs the tracker over a recording and writes all markers; a .csv also holds "
-        "the joint angles. Example: jaxhand track take.trc --model model.npz -o filled.csv",
+        "the joint angles and, of each marker, what it rests on (NAME.status, numbers as its first "
+        "lines say) and the metres that it is expected to be off (NAME.expected_error). "
+        "Example: jaxhand track take.trc --model model.npz -o filled.csv",
     )
     _add_file(tracked)
     tracked.add_argument(
@@ -205,7 +208,7 @@ def _inspect(options: argparse.Namespace) -> None:
     width = max(len(name) for name in recording.names)
     print(f"\n{'marker':{width}}  missing  gaps  longest")
     for name, marker in report["markers"].items():
-        mark = "  partly filled in by the recording software" if marker["filled"] else ""
+        mark = "  partly filled in, not measured" if marker["filled"] else ""
         print(
             f"{name:{width}}  {100 * marker['missing']:6.1f}%  {marker['gaps']:4d}  "
             f"{marker['longest_s']:6.2f}s{mark}"
@@ -237,13 +240,20 @@ def describe(recording: Recording) -> dict[str, Any]:
         "seconds": float(recording.time[-1] - recording.time[0]),
         "rate": recording.rate,
         "unit_m": recording.unit,
-        "notes": list(recording.notes),
+        "notes": [*recording.notes, *_doubts(recording)],
         "markers": markers,
         "hands": {
             name: [m for m in load_hand(name).markers if m not in recording.names]
             for name in bundled()
         },
     }
+
+
+def _doubts(recording: Recording) -> list[str]:
+    """What is wrong with the size of the hand that fits, if one does."""
+    hand = fitting_hand(recording.names)
+    doubt = doubted_unit(prefixed(recording, "", hand), hand) if hand else None
+    return [doubt] if doubt else []
 
 
 def _track(options: argparse.Namespace) -> None:
@@ -255,7 +265,7 @@ def _track(options: argparse.Namespace) -> None:
             raise ValueError(f"{output} is the recording itself: choose another name")
     recording = _read(options)
     prefixes = {"left": options.left_prefix or "", "right": options.right_prefix or ""}
-    labels = [_labels(recording, prefixes[side]) for side in outputs]
+    labels = [labels_of(recording, prefixes[side]) for side in outputs]
     model = _model(options, labels[0])
     if options.predictor:
         model = replace(model, predictor=options.predictor)
@@ -276,6 +286,9 @@ def _track(options: argparse.Namespace) -> None:
             print(f"\rtracking {100 * share:3.0f} %", end="", file=sys.stderr, flush=True)
 
     hands = [prefixed(recording, prefixes[side], model.hand) for side in outputs]
+    for side, own in zip(outputs, labels, strict=True):
+        if absent := lacking(model.hand, own):
+            print(_without(model.hand, absent, own, prefixes[side]), file=sys.stderr)
     if len(hands) == 1:
         results = [track(hands[0], model, right="right" in outputs, report=report)]
     else:
@@ -285,13 +298,13 @@ def _track(options: argparse.Namespace) -> None:
         print(file=sys.stderr)
     if options.as_measured:
         results = [as_measured(result, hand) for result, hand in zip(results, hands, strict=True)]
-    for (side, output), result in zip(outputs.items(), results, strict=True):
+    for (side, output), hand, result in zip(outputs.items(), hands, results, strict=True):
         write(result.recording, output, overwrite=options.overwrite)
         if len(outputs) > 1:
             print(f"{side} hand")
         elif side == "left" and "right" in options.file.stem.lower():
             print("tracked as a left hand, though the file's name says right: see --right")
-        print(_summary(result))
+        print(_summary(result, doubted_unit(hand, model.body)))
         print(f"wrote {output}")
 
 
@@ -305,7 +318,18 @@ def _outputs(options: argparse.Namespace) -> dict[str, Path]:
     return {"right" if options.right or options.right_prefix else "left": out}
 
 
-def _summary(result: Tracked) -> str:
+def _without(hand: Hand, absent: Sequence[str], labels: Sequence[str], prefix: str) -> str:
+    """What is said of labels that a file lacks, and which of those it has might be them."""
+    surplus = [prefix + label for label in labels if label not in hand.markers]
+    named = f"; labels not used: {', '.join(surplus)} (--map renames)" if surplus else ""
+    return (
+        f"jaxhand track: no label {', '.join(prefix + name for name in absent)}: tracked as never "
+        f"seen{named}"
+    )
+
+
+def _summary(result: Tracked, doubt: str | None) -> str:
+    """What is said of a hand that was tracked. doubt: what is wrong with its size."""
     status, state = result.status, result.state
     lines = [f"{len(state)} frames, {len(result.recording.names)} markers"]
     for name, text in (
@@ -317,12 +341,23 @@ def _summary(result: Tracked) -> str:
         share = 100 * (status == name).mean()
         if share or name != Status.REJECTED:
             lines.append(f"{share:6.2f} % of the markers {text}")
-    if (result.notice & Notice.SUSPECTED_MILLIMETRES).any():
-        lines.append("the hand is metres in size: is the file's unit right? see --unit")
-    hidden = (status == Status.PREDICTED) | (status == Status.REJECTED)
+    far = (result.notice & Notice.SUSPECTED_MILLIMETRES) > 0
+    if doubt:
+        lines.append(doubt)
+    elif far.any():
+        lines.append(
+            f"{100 * far.mean():6.2f} % of the frames have a marker over a metre from the others"
+        )
+    # What to expect was measured of markers that had been seen.
+    seen = np.logical_or.accumulate(status == Status.OBSERVED)
+    hidden = seen & ((status == Status.PREDICTED) | (status == Status.REJECTED))
     if hidden.any():
         error = 1e3 * result.expected_error[hidden].mean()
         lines.append(f"filled markers are expected to be {error:.0f} mm off on average")
+    never = ~seen[-1] & result.recording.visible.any(0)
+    if never.any():
+        names = np.array(result.recording.names)[never]
+        lines.append(f"never seen: {', '.join(names)}; filled all the same, centimetres off maybe")
     angles = result.recording.angles
     tracking = state == TrackingState.TRACKING
     if angles is None:
@@ -338,17 +373,9 @@ def _summary(result: Tracked) -> str:
     return "\n".join(lines)
 
 
-def _labels(recording: Recording, prefix: str) -> list[str]:
-    """Those that begin with the prefix, without it."""
-    labels = [name.removeprefix(prefix) for name in recording.names if name.startswith(prefix)]
-    if not labels:
-        raise ValueError(f"no label begins with {prefix!r}; there are {', '.join(recording.names)}")
-    return labels
-
-
 def _model(options: argparse.Namespace, labels: Sequence[str]) -> Model:
     if options.model in BASELINES:
-        hand = _fitting_hand(labels, "--hand FILE") if not options.hand else load_hand(options.hand)
+        hand = load_hand(options.hand) if options.hand else _fitting(labels, "--hand FILE")
         return Model(hand, predictor=options.model)
     if options.hand:
         raise ValueError(
@@ -357,35 +384,18 @@ def _model(options: argparse.Namespace, labels: Sequence[str]) -> Model:
         )
     if options.model:
         return load(options.model)
-    name = _fitting_hand(labels, "--model FILE, or a baseline: --model affine --hand FILE").name
+    name = _fitting(labels, "--model FILE, or a baseline: --model affine --hand FILE").name
     if name not in bundled_models():
         raise ValueError(f"no model is bundled for {name}: name one with --model")
     print(f"tracked by the bundled model {name}")
     return load(name)
 
 
-def _fitting_hand(labels: Sequence[str], instead: str) -> Hand:
-    """The largest bundled hand that the labels have all markers of; `instead` are the options that
-    name what to take where there is none."""
-    fits = [hand for hand in bundled() if set(load_hand(hand).markers) <= set(labels)]
-    if not fits:
-        raise ValueError(
-            f"no bundled hand fits the labels {', '.join(labels)}: rename them with --map, or "
-            f"pass {instead}{_nearly(labels)}"
-        )
-    return max(map(load_hand, fits), key=len)
-
-
-def _nearly(labels: Sequence[str]) -> str:
-    """What else could be done, if but little is missing."""
-    lacking = {name: set(load_hand(name).markers) - set(labels) for name in bundled()}
-    name = min(lacking, key=lambda name: len(lacking[name]))
-    if len(lacking[name]) <= len(load_hand(name)) // 3:
-        return f"; {name} lacks {', '.join(sorted(lacking[name]))}: an empty column would do"
-    markers = load_hand(name).markers
-    if any(label.endswith(f"_{marker}") for label in labels for marker in markers):
-        return "; what labels of a hand begin with is said by --left-prefix or --right-prefix"
-    return ""
+def _fitting(labels: Sequence[str], instead: str) -> Hand:
+    hand = fitting_hand(labels)
+    if hand is None:
+        raise ValueError(unfitting(labels, instead))
+    return hand
 
 
 def _hands(options: argparse.Namespace) -> None:

@@ -81,7 +81,9 @@ class Recording:
     unit: metres in one unit of the file.
     joints: joint truth, if the file has any.
     angles: [T, 26] radians, in the order of `hand.ANGLES`: what tracking made of the markers.
-    filled: names whose values are partly made up by the recording software (gap filling).
+    status: [T, M] a `pose.Status` each: what tracking says that a marker rests on.
+    expected_error: [T, M] metres: how far off tracking expects it to be; 0 where observed.
+    filled: names whose values are partly made up, by the recording software or by tracking.
     notes: one-line things that the reader wants the user to know.
     """
 
@@ -93,6 +95,8 @@ class Recording:
     unit: float = 1.0
     joints: JointTruth | None = None
     angles: np.ndarray | None = None
+    status: np.ndarray | None = None
+    expected_error: np.ndarray | None = None
     filled: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -117,6 +121,9 @@ class Recording:
             raise ValueError(
                 f"joints: expected {len(self.time)} frames, got {len(self.joints.positions)}"
             )
+        for field in ("status", "expected_error"):
+            if getattr(self, field) is not None:
+                _check_shape(field, getattr(self, field), self.markers.shape[:2])
         _check_known(self.filled, self.names, "filled: ")
 
     @property
@@ -132,6 +139,8 @@ class Recording:
             self,
             names=tuple(names),
             markers=self.markers[:, columns],
+            status=None if self.status is None else self.status[:, columns],
+            expected_error=None if self.expected_error is None else self.expected_error[:, columns],
             filled=tuple(name for name in self.filled if name in names),
         )
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from numpy_infer.arrays import Array
-from numpy_infer.hand import Hand
 from numpy_infer.model import Model
 from numpy_infer.pose import HandPose, Status, TrackingState
 from numpy_infer.recordings import Recording
@@ -26,15 +25,22 @@ class Tracked:
 
     recording: Recording
     """Markers `[T, M, 3]` metres and, with a joint stage, angles `[T, 26]` radians; NaN before the
-    hand was first tracked, and with the predictor `none` wherever nothing was measured."""
-    status: Array
-    """`[T, M]` a `Status` for each marker."""
-    expected_error: Array
-    """`[T, M]` metres."""
+    hand was first tracked, and with the predictor `none` wherever nothing was measured. Of every
+    marker its status and expected error."""
     state: Array
     """`[T]` a `TrackingState` for each frame."""
     notice: Array
     """`[T]` flags of `Notice`."""
+
+    @property
+    def status(self) -> Array:
+        """`[T, M]` a `Status` for each marker."""
+        return self.recording.status
+
+    @property
+    def expected_error(self) -> Array:
+        """`[T, M]` metres."""
+        return self.recording.expected_error
 
 
 def track(
@@ -109,17 +115,6 @@ def _part(report: Callable[[float], None], number: int, of: int, share: float) -
     report((number + share) / of)
 
 
-def prefixed(recording: Recording, prefix: str, hand: Hand) -> Recording:
-    """The markers of one hand whose labels all begin with `prefix`, under the hand's own names.
-
-    Raises:
-        ValueError: one of them is not in the recording.
-    """
-    own = recording.select([prefix + name for name in hand.markers])
-    filled = tuple(name.removeprefix(prefix) for name in own.filled)
-    return replace(own, names=hand.markers, filled=filled)
-
-
 def _tracked(recording: Recording, model: Model, poses: Sequence[HandPose]) -> Tracked:
     def of(name: str) -> Any:
         parts = [getattr(pose, name) for pose in poses]
@@ -135,7 +130,8 @@ def _tracked(recording: Recording, model: Model, poses: Sequence[HandPose]) -> T
         markers=np.where(begun[:, None, None], markers, np.nan),
         angles=None if angles is None else np.where(begun[:, None], angles, np.nan),
         joints=None,
+        status=status,
+        expected_error=np.where(begun[:, None], of("expected_error"), 0),
         filled=tuple(np.array(recording.names)[some].tolist()),
     )
-    expected_error = np.where(begun[:, None], of("expected_error"), 0)
-    return Tracked(filled, status, expected_error, state, of("notice"))
+    return Tracked(filled, state, of("notice"))

@@ -16,9 +16,10 @@ import numpy_infer.cli
 from numpy_infer import load_hand
 from numpy_infer.cli import _summary, check_output, main
 from numpy_infer.hand import ANGLES
-from numpy_infer.pose import TrackingState
+from numpy_infer.model import load
+from numpy_infer.pose import Status, TrackingState
 from numpy_infer.recordings import Recording, read, write
-from numpy_infer.tracking import Tracked
+from numpy_infer.tracking import Tracked, track
 
 HAND = load_hand("glove9")
 
@@ -164,24 +165,42 @@ def test_only_what_has_been_filled_is_said_to_be(take: str, tmp_path: Path) -> N
     assert read("out.tsv").filled == (HAND.markers[3],)
 
 
+def test_a_filled_table_says_what_was_measured_and_how_far_off_the_rest_may_be(
+    take: str, tmp_path: Path
+) -> None:
+    """As the tracker says it live, `--as-measured` or not."""
+    recording = read(take)
+    markers = recording.markers.copy()
+    markers[:5] = markers[10:20, 3] = markers[15:, 7] = np.nan
+    write(replace(recording, markers=markers), tmp_path / "gap.csv")
+    result = track(read("gap.csv"), load("glove9"))
+    for option in ([], ["--as-measured"]):
+        assert main(["track", "gap.csv", "-o", "out.csv", "--overwrite", *option]) == 0
+        lines = Path("out.csv").read_text().splitlines()
+        header, *rows = (line.split(",") for line in lines if not line.startswith("#"))
+        for kind, wanted in (("status", result.status), ("expected_error", result.expected_error)):
+            columns = [header.index(f"{name}.{kind}") for name in HAND.markers]
+            told = np.array([[float(row[i] or "nan") for i in columns] for row in rows])
+            np.testing.assert_allclose(told[5:], wanted[5:], rtol=0, atol=1e-6)
+            assert told[5:].any()
+        assert np.isnan(told[:5]).all(), "no error is known of what is blank"
+        assert read("out.csv").names == HAND.markers
+
+
 def test_fingers_bent_backwards_are_told_of(capsys: pytest.CaptureFixture[str]) -> None:
     recording = Recording(HAND.markers, np.zeros((4, 9, 3)), np.arange(4) / 60, 60.0, source="")
     for degrees, told in ((-45, True), (10, False)):
         angles = np.zeros((4, len(ANGLES)))
         angles[:, [a.name.endswith("mcp_flexion") for a in ANGLES]] = np.radians(degrees)
         nothing = np.zeros((4, 9))
-        result = Tracked(
-            replace(recording, angles=angles),
-            nothing,
-            nothing,
-            nothing[:, 0],
-            nothing[:, 0].astype(int),
-        )
-        assert ("bent backwards" in _summary(result)) == told
+        recording = replace(recording, status=nothing, expected_error=nothing)
+        notice = nothing[:, 0].astype(int)
+        result = Tracked(replace(recording, angles=angles), nothing[:, 0], notice)
+        assert ("bent backwards" in _summary(result, None)) == told
     never = replace(recording, angles=np.full((4, len(ANGLES)), np.nan))
     lost = nothing[:, 0] + TrackingState.LOST
-    assert "bent" not in _summary(replace(result, recording=never, state=lost))
-    assert "no joint angles" in _summary(replace(result, recording=recording))
+    assert "bent" not in _summary(replace(result, recording=never, state=lost), None)
+    assert "no joint angles" in _summary(replace(result, recording=recording), None)
 
 
 def test_a_name_that_says_right_is_heard(take: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -192,13 +211,94 @@ def test_a_name_that_says_right_is_heard(take: str, capsys: pytest.CaptureFixtur
     assert "name says right" not in capsys.readouterr().out
 
 
-def test_what_is_nearly_a_hand_is_told_what_it_lacks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_a_label_that_the_file_lacks_is_as_an_empty_column_and_told_of(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    a_recording(tmp_path / "eight.csv", names=HAND.markers[:-1])
-    assert main(["track", "eight.csv", "-o", "out.csv"]) == 2
-    assert f"glove9 lacks {HAND.markers[-1]}: an empty column would do" in capsys.readouterr().err
+    whole = read(take)
+    markers = whole.markers + 1e-3 * np.random.default_rng(0).normal(size=(30, 9, 3))
+    for name, names in (("without.csv", HAND.markers[:-1]), ("misspelt.csv", HAND.markers)):
+        part = replace(whole, markers=markers).select(names)
+        write(part.rename({n: f"{n}?" for n in names[8:]}), tmp_path / name)
+    markers[:, 8] = np.nan
+    write(replace(whole, markers=markers), tmp_path / "empty.csv")
+    assert main(["track", "empty.csv", "-o", "expected.csv"]) == 0
+    printed = capsys.readouterr()
+    assert f"never seen: {HAND.markers[8]}; filled" in printed.out
+    assert printed.err == ""
+    for model in ([], ["--model", "glove9"]):
+        for name in ("without.csv", "misspelt.csv"):
+            assert main(["track", name, "-o", "out.csv", "--overwrite", *model]) == 0
+            assert Path("out.csv").read_bytes() == Path("expected.csv").read_bytes()
+            error = capsys.readouterr().err
+            assert f"no label {HAND.markers[8]}: tracked as never seen" in error
+            used = f"labels not used: {HAND.markers[8]}? (--map renames)"
+            assert (used in error) == (name == "misspelt.csv")
+            assert error.count("\n") == 1
+    assert main(["track", "without.csv", "--predictor", "none", "-o", "o.csv"]) == 0
+    assert "never seen" not in capsys.readouterr().out, "nothing is filled"
+
+
+def test_what_to_expect_is_said_of_markers_that_were_seen() -> None:
+    """What a marker never seen is off is known to nobody."""
+    shape = (4, 9)
+    status = np.full(shape, Status.PREDICTED)
+    status[0, :2] = status[2, 2] = Status.OBSERVED
+    off = np.full(shape, 0.9)
+    off[1:, :2] = off[3, 2] = 0.005
+    time, markers = np.arange(4) / 60, np.zeros((*shape, 3))
+    made = Recording(
+        HAND.markers, markers, time, 60.0, source="", status=status, expected_error=off
+    )
+    said = _summary(Tracked(made, np.zeros(4), np.zeros(4, int)), None)
+    assert "expected to be 5 mm off" in said
+    assert f"never seen: {', '.join(HAND.markers[3:])}; filled" in said
+
+
+def test_too_few_labels_are_refused_with_what_is_lacking(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    a_recording(tmp_path / "five.csv", names=HAND.markers[:5])
+    error = refused(["track", "five.csv", "-o", "out.csv"], capsys)
+    assert f"glove9 lacks {', '.join(HAND.markers[5:])}" in error
+    error = refused(["track", "five.csv", "-o", "out.csv", "--model", "glove9"], capsys)
+    assert f"no marker {', '.join(HAND.markers[5:])}; there are {HAND.markers[0]}, " in error
     a_recording(tmp_path / "left.csv", prefix="L_")
-    assert main(["track", "left.csv", "-o", "out.csv"]) == 2
-    assert "--left-prefix" in capsys.readouterr().err
+    assert "--left-prefix" in refused(["track", "left.csv", "-o", "out.csv"], capsys)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [
+        (0.1, ("10 times too small for a hand: is the unit, 1 m by", "right? 10 m would do")),
+        (1000, ("1000 times too large for a hand", "right? 0.001 m would do")),
+        (1, ()),
+    ],
+)
+def test_a_wrong_unit_is_told_of(
+    factor: float,
+    said: tuple[str, ...],
+    take: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    recording = read(take)
+    write(replace(recording, markers=factor * recording.markers), tmp_path / "other.csv")
+    for arguments in (["inspect", "other.csv"], ["track", "other.csv", "-o", "out.csv"]):
+        assert main(arguments) == 0
+        printed = capsys.readouterr().out
+        assert all(part in printed for part in said)
+        assert ("for a hand" in printed) == bool(said)
+        assert "over a metre" not in printed, "the unit is reason enough"
+
+
+def test_one_marker_far_away_is_no_matter_of_units(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read(take)
+    markers = recording.markers.copy()
+    markers[15:, 3] += [5, 0, 0]
+    write(replace(recording, markers=markers), tmp_path / "far.csv")
+    assert main(["track", "far.csv", "--no-gate", "-o", "out.csv"]) == 0
+    printed = capsys.readouterr().out
+    assert " 50.00 % of the frames have a marker over a metre from the others" in printed
+    assert "for a hand" not in printed

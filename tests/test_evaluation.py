@@ -150,6 +150,7 @@ def test_a_table_is_the_same_every_time_and_orders_the_methods(tmp_path: Path) -
         (["--data", "recordings:DIR", "--model", "affine", "--json", "HERE"], "--overwrite"),
         (["--data", "nowhere:DIR", "--json", "no/t.json"], "no is no folder: make it first"),
         (["--data", "nowhere:DIR", "--plot", "no/t.png"], "no is no folder: make it first"),
+        (["--data", "nowhere:DIR", "--plot", "t.xyz"], "t.xyz: cannot draw '.xyz'; known: ."),
         (["--data", "recordings:DIR", "--model", "affine", "--seeds", "0"], "seeds"),
         (["--data", "a:b", "--data", "c:d", "--model", "affine"], "one --data, found 2"),
         (["--model", "affine"], "one --data, found 0"),

@@ -324,7 +324,7 @@ def test_plain_csv_without_a_unit_asks_for_it(put: Callable) -> None:
 
 
 def test_plain_csv_notes_the_angles_that_it_skips(put: Callable) -> None:
-    assert "1 columns of angles (.deg) are skipped" in read(put("take.csv", CSV)).notes
+    assert "1 columns of tracking (.deg) are not markers" in read(put("take.csv", CSV)).notes
 
 
 def test_plain_csv_of_one_frame_needs_a_rate(put: Callable) -> None:

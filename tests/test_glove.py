@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from rich.console import Console
 from simulated import motion, worn
 
 from jaxhand import cli, glove
+from jaxhand.calibration import Calibration
+from jaxhand.datasets import SIG18_AS_GLOVE9
 from numpy_infer import HandTracker, load_hand, model, wearer
 from numpy_infer.geometry import mirror
 from numpy_infer.hand import POINTS
@@ -39,6 +42,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     time = np.arange(frames) / RATE
     write(Recording(GLOVE.markers, markers, time, RATE, source=""), folder / "left.csv")
     write(Recording(GLOVE.markers, mirror(markers), time, RATE, source=""), folder / "right.csv")
+    names = [prefix + name for prefix in ("L_", "R_") for name in GLOVE.markers]
+    both = np.concatenate([markers, mirror(markers) + 0.3], 1)
+    write(Recording(names, both, time, RATE, source=""), folder / "both.csv")
+    others = [*GLOVE.markers[2::-1], *GLOVE.markers[3:]]
+    write(Recording(others, markers, time, RATE, source=""), folder / "mislabelled.csv")
+    write(Recording(GLOVE.markers, 0.1 * markers, time, RATE, source=""), folder / "small.csv")
     return folder
 
 
@@ -80,6 +89,79 @@ def test_a_glove_is_described_by_its_motion(folder: Path, tmp_path: Path) -> Non
     assert abs(apart - wanted) < 3e-3
 
 
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_either_hand_of_a_file_is_measured_as_if_it_were_alone(
+    side: str, folder: Path, tmp_path: Path
+) -> None:
+    right = ["--right"] if side == "right" else []
+    model = ["--model", str(folder / "model.npz")]
+    prefix = [f"--{side}-prefix", side[0].upper() + "_"]
+    for verb, options in ((cli.calibrate, model), (cli.hand, ["--name", "mine"])):
+        for name, more in ((side, right), ("both", prefix)):
+            out = ["-o", str(tmp_path / f"{name}.json"), "--overwrite"]
+            assert verb([str(folder / f"{name}.csv"), *options, *out, *more]) == 0
+        alone, one = (load_json(tmp_path / f"{name}.json") for name in (side, "both"))
+        np.testing.assert_allclose(alone, one, rtol=0, atol=1e-4)
+
+
+def load_json(path: Path) -> list[float]:
+    """All numbers of a file."""
+    return [float(number) for number in re.findall(r"-?\d+\.\d+", path.read_text("utf-8"))]
+
+
+def test_a_fit_that_is_none_is_told_of(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Labels exchanged on the back of the hand, which then is much like one of the other side; and
+    the wrong side."""
+    model = ["--model", str(folder / "model.npz"), "-o", str(tmp_path / "me.json"), "--overwrite"]
+    for name, right, poor, side in (
+        ("left", [], False, ""),
+        ("right", ["--right"], False, ""),
+        ("mislabelled", [], True, None),
+        ("right", [], None, "right"),
+        ("left", ["--right"], None, "left"),
+    ):
+        assert cli.calibrate([str(folder / f"{name}.csv"), *model, *right]) == 0
+        printed = capsys.readouterr().out
+        assert "mm, root mean square (usual: 5 to 15 mm)" in printed
+        if poor is not None:
+            assert ("a poor fit" in printed) == poor
+        if side is not None:
+            assert ("hand they fit better" in printed) == bool(side)
+            assert not side or f"as a {side} hand they fit better" in printed
+
+
+@pytest.mark.parametrize("user", ["User1", "User2", "User3"])
+def test_a_recorded_hand_is_of_its_own_side(
+    user: str, data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of its markers the nine of the bundled model, which has never seen a recorded hand."""
+    (folder, *_) = sorted((data_root / "sig18" / user).iterdir())
+    takes = [read(path) for path in sorted(folder.glob("*_left.trc"))]
+    markers = np.concatenate([take.rename(SIG18_AS_GLOVE9).markers for take in takes])
+    names = takes[0].rename(SIG18_AS_GLOVE9).names
+    time = np.arange(len(markers)) / takes[0].rate
+    write(Recording(names, markers, time, takes[0].rate, source=""), tmp_path / "left.trc")
+    for right in ([], ["--right"]):
+        out = ["-o", str(tmp_path / "me.json"), "--overwrite"]
+        assert cli.calibrate([str(tmp_path / "left.trc"), "--model", "glove9", *out, *right]) == 0
+        printed = capsys.readouterr().out
+        assert ("as a left hand they fit better" in printed) == bool(right)
+        assert "a poor fit" not in printed or right
+
+
+@pytest.mark.parametrize(
+    ("off", "size", "poor"),
+    [(2e-3, 1.2, False), (5e-3, 1.0, True), (2e-3, 0.7, True), (2e-3, 1.4, True)],
+)
+def test_a_fit_of_all_bones_is_judged_too(off: float, size: float, poor: bool) -> None:
+    found = Calibration(
+        **dict.fromkeys(Calibration._fields),
+    )._replace(hand=GLOVE.resized(size), residual=np.full((3, 9), off), tracked=np.ones(3, bool))
+    assert any("a poor fit" in line for line in glove._bones(found, GLOVE)) == poor
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -88,6 +170,9 @@ def test_a_glove_is_described_by_its_motion(folder: Path, tmp_path: Path) -> Non
         ({"recording": "nothing.csv"}, "nothing.csv"),
         ({"out": "nodir/me.json"}, "nodir is no folder: make it first"),
         ({"out": "."}, "is a folder: choose another name"),
+        ({"recording": "SMALL"}, "10 times too small for a hand: is the unit"),
+        ({"--left-prefix": "Q_"}, "no label begins with 'Q_'; there are pinky_base, "),
+        ({"--left-prefix": "L_", "--right-prefix": "R_"}, "one hand at a time"),
     ],
 )
 def test_a_mistake_is_one_clear_line_before_the_fit(
@@ -101,7 +186,10 @@ def test_a_mistake_is_one_clear_line_before_the_fit(
     monkeypatch.setattr(glove, "hand_size", lambda *_: pytest.fail("fitted first"))
     given = {"--model": str(folder / "model.npz"), "--flat": "0", "out": "me.json", **change}
     recording = change.get("recording", str(folder / "left.csv"))
+    recording = recording.replace("SMALL", str(folder / "small.csv"))
     arguments = [recording, "-o", str(tmp_path / given["out"]), "--model", given["--model"]]
+    for option in ("--left-prefix", "--right-prefix"):
+        arguments += [option, change[option]] if option in change else []
     assert cli.calibrate([*arguments, "--flat", given["--flat"], "30"]) == 2
     error = capsys.readouterr().err
     assert message in error

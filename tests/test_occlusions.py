@@ -306,6 +306,8 @@ def test_labels_are_renamed_by_a_map_and_a_hand_that_does_not_fit_is_told(tmp_pa
         run(file, hand="dense19")
     with pytest.raises(ValueError, match="nodir is no folder: make it first"):
         run(file, json=tmp_path / "nodir" / "stats.json")
+    with pytest.raises(ValueError, match=r"gaps\.xyz: cannot draw '\.xyz'; known: .*\.png, "):
+        run(file, picture=tmp_path / "gaps.xyz")
     with pytest.raises(ValueError, match="expected marker files, or the word simulated"):
         run()
 

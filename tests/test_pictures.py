@@ -132,6 +132,14 @@ def test_nothing_is_replaced_unasked(tmp_path: Path, which: str) -> None:
     assert is_png(path)
 
 
+@pytest.mark.parametrize("name", ["p.xyz", "p", "p.png.gz", "png"])
+def test_an_ending_that_is_no_picture_is_refused_before_the_work(name: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"cannot draw '.*'; known: .*\.png, "):
+        pictures.check_picture(tmp_path / name, overwrite=True)
+    for known in ("p.png", "P.SVG", "a.b.pdf"):
+        pictures.check_picture(tmp_path / known, overwrite=False)
+
+
 def test_curves_of_table_4_begin_at_nothing_hidden(tmp_path: Path) -> None:
     joints = table(learned=1.0, ik=2.0, of_mine=3.0)
     for rows in joints.values():

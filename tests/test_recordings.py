@@ -3,6 +3,7 @@
 import json
 import sys
 import tomllib
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,6 +17,7 @@ from jaxhand import c3d
 from numpy_infer import recordings
 from numpy_infer.formats import plain_csv, qualisys, trc
 from numpy_infer.formats.authors import read_hand_csv
+from numpy_infer.pose import Status
 from numpy_infer.recordings import JointTruth, Recording, load_label_map, median_rate, read, write
 
 # Metres lost by writing and reading: CSV keeps every digit, TRC and TSV nanometres, C3D float32.
@@ -91,6 +93,36 @@ def test_what_is_written_reads_back(
     assert_same(got, recording, PRECISION[suffix])
     np.testing.assert_array_equal(got.time, recording.time)
     assert list(path.parent.iterdir()) == [path]
+
+
+@given(data=st.data())
+def test_what_tracking_says_is_written_beside_the_markers(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """And read as what it is: other columns, in a file of the same markers."""
+    recording = data.draw(a_recording())
+    shape = recording.markers.shape[:2]
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    status, off = rng.integers(len(Status), size=shape), rng.random(shape).round(6)
+    status[:, 0] = 0
+    path = tmp_path_factory.mktemp("round") / "take.csv"
+    write(replace(recording, status=status, expected_error=off), path)
+    got = read(path)
+    assert_same(got, recording, 0.0)
+    np.testing.assert_array_equal(got.time, recording.time)
+    assert got.filled == tuple(np.array(recording.names)[status.any(0)])
+    lines = path.read_text("utf-8").splitlines()
+    assert "# status: 0 observed, 1 predicted, 2 held, 3 rejected" in lines
+    header, *rows = (line.split(",") for line in lines if not line.startswith("#"))
+    for i, name in enumerate(recording.names):
+        for wanted, kind in ((status, "status"), (off, "expected_error")):
+            column = [row[header.index(f"{name}.{kind}")] for row in rows]
+            blank = ~recording.visible[:, i] & (kind == "expected_error")
+            told = np.array([float(cell or "nan") for cell in column])
+            np.testing.assert_array_equal(told, np.where(blank, np.nan, wanted[:, i]))
+    chosen = replace(recording, status=status, expected_error=off).select(recording.names[::-1])
+    np.testing.assert_array_equal(chosen.status, status[:, ::-1])
+    np.testing.assert_array_equal(chosen.expected_error, off[:, ::-1])
 
 
 @NEEDS_EZC3D
@@ -196,6 +228,7 @@ def test_a_half_hidden_marker_is_written_as_a_gap(
     [
         ({"names": ("a", "a")}, "duplicate marker name 'a'"),
         ({"names": ("a",)}, r"markers: expected shape \(3, 1, 3\), got \(3, 2, 3\)"),
+        ({"status": np.zeros((3, 1))}, r"status: expected shape \(3, 2\), got \(3, 1\)"),
         ({"markers": np.zeros((3, 2))}, "markers: expected shape"),
         ({"time": [0.0, np.nan, 1.0]}, "time: frame 1"),
         ({"time": [0.0, 1.0]}, "markers: expected shape"),

@@ -12,8 +12,9 @@ import pytest
 from numpy_infer import HandTracker, Model, Status, TrackingState, load_hand, wearer
 from numpy_infer.cli import describe, main, parser
 from numpy_infer.geometry import mirror
+from numpy_infer.labels import prefixed
 from numpy_infer.recordings import Recording, read, write
-from numpy_infer.tracking import prefixed, track, track_hands
+from numpy_infer.tracking import track, track_hands
 
 HAND = load_hand("glove9")
 
@@ -219,15 +220,19 @@ def test_inspect_counts_gaps_and_finds_the_hand(
     assert json.loads(capsys.readouterr().out)["rate"] == 60
 
 
-def test_a_label_map_renames(tmp_path: Path) -> None:
+def test_a_label_map_renames(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recording = recording_with_gaps().rename({"wrist": "WR"})
     file, labels, out = tmp_path / "take.csv", tmp_path / "labels.json", tmp_path / "out.csv"
     write(recording, file)
     labels.write_text(json.dumps({"WR": "wrist"}))
     arguments = ["track", str(file), "--model", "affine", "-o", str(out)]
-    assert main(arguments) == 2
     assert main([*arguments, "--map", str(labels)]) == 0
+    assert capsys.readouterr().err == ""
     assert read(out).names == HAND.markers
+    assert "wrist" not in read(out).filled
+    assert main([*arguments, "--overwrite"]) == 0
+    assert "no label wrist: tracked as never seen" in capsys.readouterr().err
+    assert "wrist" in read(out).filled
 
 
 def test_a_calibration_is_for_the_same_glove(

@@ -23,7 +23,7 @@ from small_training import (  # noqa: E402
     with_gaps,
 )
 
-from jaxhand import cli, options, runs, tasks, training, training_data  # noqa: E402
+from jaxhand import cli, options, tasks, training, training_data  # noqa: E402
 from jaxhand.networks import predict  # noqa: E402
 from jaxhand.occlusions import save, statistics  # noqa: E402
 from jaxhand.skeleton import (  # noqa: E402
@@ -388,30 +388,6 @@ def test_layers_are_read_from_text_and_file(tmp_path: Path) -> None:
     for wrong in ("200,x", "0", "1.5", "", "-3"):
         with pytest.raises(ValueError, match="layer"):
             options.read_layers(wrong)
-
-
-def plain(**options: Any) -> dict[str, Any]:
-    return {"seed": 0, "epochs": 3, "resume": False, "overwrite": False, **options}
-
-
-def test_a_used_folder_is_refused_unless_told_what_to_do(tmp_path: Path) -> None:
-    runs.check(tmp_path / "new", plain())
-    runs.create(tmp_path / "new", plain())
-    with pytest.raises(ValueError, match=r"--resume .* --overwrite"):
-        runs.check(tmp_path / "new", plain())
-    runs.check(tmp_path / "new", plain(resume=True, epochs=9))
-    with pytest.raises(ValueError, match="trained with seed 0, not 1"):
-        runs.check(tmp_path / "new", plain(resume=True, seed=1))
-    with pytest.raises(ValueError, match="no run to resume"):
-        runs.check(tmp_path, plain(resume=True))
-
-
-def test_overwriting_removes_a_runs_own_files_only(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work")
-    (tmp_path / "metrics.jsonl").write_text("{}\n")
-    (tmp_path / "checkpoints" / "marker_network").mkdir(parents=True)
-    runs.create(tmp_path, plain(overwrite=True))
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.json", "thesis.tex"]
 
 
 def test_the_command_line_says_what_is_wrong_in_one_line(

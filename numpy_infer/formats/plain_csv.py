@@ -8,8 +8,10 @@
     0.00833,,,
 
 Comment lines come first; `unit` must be there or be given, `rate` and `frames` are optional. A
-blank or NaN cell is a gap. Columns that end in `.deg` (joint angles) are skipped with a note. A
-file that we write reads back bit for bit.
+blank or NaN cell is a gap. What tracking adds is read with a note alone: columns that end in `.deg`
+(joint angles), and of each marker `NAME.status`, where numbers other than 0 say that it was filled,
+and `NAME.expected_error`, in the file's unit. The markers of a file that we write read back bit for
+bit.
 """
 
 from __future__ import annotations
@@ -29,7 +31,11 @@ from numpy_infer.formats.table import (
 )
 from numpy_infer.formats.units import agreed, metres_per
 from numpy_infer.hand import ANGLES
+from numpy_infer.pose import Status
 from numpy_infer.recordings import Recording, median_rate
+
+TRACKED = (".deg", ".status", ".expected_error")
+"""Endings of columns that tracking adds."""
 
 
 def read(path: Path, *, unit: float | None = None, left_handed: bool = False) -> Recording:
@@ -40,6 +46,9 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     scale = agreed(path, stated, unit)
     cells = file.unique(header, file.cells(header, ","), "column")
     names, columns, notes = _columns(file, header, cells)
+    status = {
+        cell.removesuffix(".status"): i for i, cell in enumerate(cells) if cell.endswith(".status")
+    }
     table = file.numbers(header + 1, len(cells), ",")
     time = table[:, 0]
     file.check_time(time, header + 1)
@@ -57,13 +66,15 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         rate=rate,
         source=str(path),
         unit=scale,
+        filled=tuple(n for n in names if n in status and (table[:, status[n]] > 0).any()),
         notes=file.notes + notes,
     )
     return recording.reflected() if left_handed else recording
 
 
 def write(recording: Recording, path: Path) -> None:
-    """Write metres with every digit, and degrees where there are angles; gaps are blank."""
+    """Write metres with every digit, and what tracking says: angles in degrees, of each marker what
+    it rests on, and to the micrometre how far off to expect it. Gaps are blank."""
     check_writable(recording.names)
     columns = [f"{name}.{axis}" for name in recording.names for axis in "xyz"]
     markers = np.where(recording.visible[..., None], recording.markers, np.nan)
@@ -71,12 +82,20 @@ def write(recording: Recording, path: Path) -> None:
     if recording.angles is not None:
         columns += [f"{angle.name}.deg" for angle in ANGLES]
         table = np.concatenate([table, np.degrees(recording.angles)], -1)
-    lines = [
+    comments = [
         "# unit: m",
         f"# rate: {number(recording.rate)}",
         f"# frames: {len(recording.time)}",
-        ",".join(["time", *columns]),
     ]
+    if recording.status is not None:
+        comments.append("# status: " + ", ".join(f"{s.value} {s.name.lower()}" for s in Status))
+        columns += [f"{name}.status" for name in recording.names]
+        table = np.concatenate([table, recording.status], -1)
+    if recording.expected_error is not None:
+        columns += [f"{name}.expected_error" for name in recording.names]
+        expected = np.where(recording.visible, recording.expected_error, np.nan)
+        table = np.concatenate([table, expected.round(6)], -1)
+    lines = [*comments, ",".join(["time", *columns])]
     for time, row in zip(recording.time, table.tolist(), strict=True):
         cells = ["" if value != value else number(value) for value in row]
         lines.append(",".join([number(time), *cells]))
@@ -106,8 +125,8 @@ def _columns(
             "time,NAME.x,NAME.y,NAME.z,… for all markers",
         )
     place = {cell: index for index, cell in enumerate(cells)}
-    angles = [cell for cell in cells if cell.endswith(".deg")]
-    coordinates = [cell for cell in cells[1:] if not cell.endswith(".deg")]
+    tracked = [cell for cell in cells[1:] if cell.endswith(TRACKED)]
+    coordinates = [cell for cell in cells[1:] if not cell.endswith(TRACKED)]
     names = tuple(dict.fromkeys(cell.rpartition(".")[0] for cell in coordinates))
     for cell in coordinates:
         if not cell.endswith((".x", ".y", ".z")) or len(cell) < 3:
@@ -119,5 +138,6 @@ def _columns(
     if not names:
         raise file.error(header, "no marker columns; expected NAME.x, NAME.y, NAME.z")
     columns = np.array([[place[f"{name}.{axis}"] for axis in "xyz"] for name in names])
-    notes = (f"{len(angles)} columns of angles (.deg) are skipped",) if angles else ()
-    return names, columns, notes
+    kinds = [kind for kind in TRACKED if any(cell.endswith(kind) for cell in tracked)]
+    notes = (f"{len(tracked)} columns of tracking ({', '.join(kinds)}) are not markers",)
+    return names, columns, notes if tracked else ()

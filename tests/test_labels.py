@@ -1,0 +1,170 @@
+"""Labels tell the hand they are of, whatever else is in the file; a few may be missing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxhand.strategies import Motion, rigid_motions
+from numpy_infer.arrays import Array
+from numpy_infer.geometry import transform
+from numpy_infer.hand import HIGH, LOW, Hand, bundled, load_hand
+from numpy_infer.labels import (
+    DISPENSABLE,
+    doubted_unit,
+    fitting_hand,
+    lacking,
+    prefixed,
+    tracked_without,
+)
+from numpy_infer.recordings import Recording, read
+from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
+
+HANDS = [load_hand(name) for name in bundled()]
+GLOVE = load_hand("glove9")
+hands = st.sampled_from(HANDS)
+
+
+def recording(names: tuple[str, ...], markers: Array) -> Recording:
+    return Recording(names, markers, np.arange(len(markers)) / 60, 60.0, "made up", unit=0.01)
+
+
+# -- which hand ----------------------------------------------------------------------------------
+
+
+@given(hands, st.data())
+def test_labels_in_any_order_beside_others_are_of_their_hand(
+    hand: Hand, data: st.DataObject
+) -> None:
+    most = int(DISPENSABLE * len(hand))
+    absent = data.draw(st.lists(st.sampled_from(hand.markers), max_size=most, unique=True))
+    others = [f"pillow{i}" for i in range(data.draw(st.integers(0, 30)))]
+    labels = data.draw(st.permutations([*lacking(hand, absent), *others]))
+    found = fitting_hand(labels)
+    assert found is not None
+    assert found.name == hand.name
+    assert lacking(hand, labels) == [name for name in hand.markers if name in absent]
+
+
+def test_a_hand_that_is_whole_is_taken_before_a_larger_one_that_is_not() -> None:
+    dense = load_hand("dense19")
+    for labels, name in ((dense.markers[1:], "glove9"), (dense.markers, "dense19")):
+        found = fitting_hand([*GLOVE.markers, *labels])
+        assert found is not None
+        assert found.name == name
+    assert fitting_hand(["pillow", *GLOVE.markers[:5]]) is None
+
+
+@pytest.mark.parametrize("hand", HANDS, ids=lambda hand: hand.name)
+def test_a_third_of_the_markers_can_be_done_without_and_no_more(hand: Hand) -> None:
+    most = int(DISPENSABLE * len(hand))
+    rng = np.random.default_rng(0)
+    some = [rng.permutation(hand.markers)[:most].tolist() for _ in range(200)]
+    assert all(tracked_without(hand, absent) for absent in some)
+    assert not tracked_without(hand, hand.markers[: most + 1])
+
+
+def test_what_is_left_determines_where_the_hand_is() -> None:
+    """Of four markers any may be missing, unless the others are in line."""
+    four = replace(GLOVE, markers=GLOVE.markers[:4], template=np.eye(4, 3) * 0.05)
+    assert all(tracked_without(four, [name]) for name in four.markers)
+    line = np.array([[0.0, 0, 0], [0.05, 0, 0], [0.1, 0, 0], [0, 0.05, 0]])
+    told = [tracked_without(replace(four, template=line), [name]) for name in four.markers]
+    assert told == [True, True, True, False]
+
+
+# -- its markers ---------------------------------------------------------------------------------
+
+
+@given(hands, st.sampled_from(["", "L_"]), st.data())
+def test_markers_come_by_name_and_what_has_no_label_is_never_seen(
+    hand: Hand, prefix: str, data: st.DataObject
+) -> None:
+    absent = data.draw(st.lists(st.sampled_from(hand.markers), max_size=len(hand) - 1, unique=True))
+    labels = data.draw(st.permutations([*lacking(hand, absent), "pillow"]))
+    rng = np.random.default_rng(0)
+    names = (*(prefix + label for label in labels), "elsewhere")
+    file = replace(recording(names, rng.normal(size=(4, len(names), 3))), filled=names[:2])
+    if not tracked_without(hand, absent):
+        with pytest.raises(ValueError, match="made up: no marker ") as error:
+            prefixed(file, prefix, hand)
+        named, there = str(error.value).split("; there are ")
+        missing = [prefix + name for name in hand.markers if name in absent]
+        assert named == f"made up: no marker {', '.join(missing)}"
+        assert there == ", ".join(names)
+        return
+    own = prefixed(file, prefix, hand)
+    assert own.names == hand.markers
+    assert set(own.filled) == set(labels[:2]) - {"pillow"}
+    for name, markers in zip(own.names, own.markers.swapaxes(0, 1), strict=True):
+        known = name not in absent
+        wanted = file.markers[:, names.index(prefix + name)] if known else np.nan
+        np.testing.assert_array_equal(markers, np.broadcast_to(wanted, (4, 3)))
+
+
+def test_a_prefix_that_no_label_has_is_an_error() -> None:
+    file = recording(GLOVE.markers, GLOVE.template[None])
+    with pytest.raises(ValueError, match="no label begins with 'L_'; there are pinky_base, "):
+        prefixed(file, "L_", GLOVE)
+
+
+# -- its size ------------------------------------------------------------------------------------
+
+
+def postures(hand: Hand, seed: int, frames: int = 8) -> Array:
+    """`[T, M, 3]` metres: angles anywhere in their ranges."""
+    angles = np.random.default_rng(seed).uniform(LOW, HIGH, (frames, len(LOW)))
+    wrist = np.broadcast_to(np.eye(3), (frames, 3, 3)), np.zeros((frames, 3))
+    points, rotations = forward_kinematics(hand.skeleton, rotations_from_angles(angles), *wrist)
+    markers: Array = marker_positions(hand, points, rotations)
+    return markers
+
+
+@given(hands, st.integers(-3, 3), st.integers(0, 99), rigid_motions(), st.floats(0.85, 1.2))
+def test_a_unit_that_is_wrong_by_tens_is_doubted_and_the_right_one_named(
+    hand: Hand, power: int, seed: int, motion: Motion, size: float
+) -> None:
+    """Of small people and tall ones, wherever they are, with gaps, a ghost and more labels."""
+    rng = np.random.default_rng(seed)
+    markers = transform(*motion, size * postures(hand, seed))
+    markers[rng.random(markers.shape[:2]) < 0.3] = np.nan
+    markers[:, seed % len(hand)] += 2.0
+    file = recording(hand.markers, 10.0**power * markers)
+    order = rng.permutation(len(hand))
+    file = file.select([hand.markers[i] for i in order])
+    told = doubted_unit(file, hand)
+    if power == 0:
+        assert told is None
+        return
+    assert told is not None
+    much = "large" if power > 0 else "small"
+    assert told.startswith(f"the markers are {10 ** abs(power)} times too {much} for a hand: ")
+    assert "is the unit, 0.01 m by" in told
+    assert told.endswith(f" {0.01 / 10**power:g} m would do")
+
+
+def test_what_is_not_seen_has_no_size() -> None:
+    nothing = np.full((3, 9, 3), np.nan)
+    assert doubted_unit(recording(GLOVE.markers, nothing), GLOVE) is None
+    nothing[:, 0] = 5.0
+    assert doubted_unit(recording(GLOVE.markers, nothing), GLOVE) is None
+    nothing[:] = 5.0
+    assert doubted_unit(recording(GLOVE.markers, nothing), GLOVE) is None, "all at one place"
+
+
+def test_no_real_recording_is_doubted(data_root: Path) -> None:
+    files = [data_root / "qualisys" / "recording.tsv"]
+    for user in ("User1", "User2", "User3"):
+        files += sorted((data_root / "sig18" / user).glob("*/*.trc"))[::20]
+    for file in files:
+        found = read(file)
+        hand = fitting_hand(found.names)
+        assert hand is not None
+        assert doubted_unit(found, hand) is None
+        smaller = replace(found, markers=0.1 * found.markers)
+        assert "10 times too small" in str(doubted_unit(smaller, hand))
