@@ -61,7 +61,7 @@ STAGES: dict[str, tuple[tuple[ModuleType, str], ...]] = {
     "finger alignment": (
         *((joints, "bend_fingers"), (skeleton, "shortest_arc"), (skeleton, "_euler")),
     ),
-    "forward kinematics": ((joints, "place_fingers"), (joints, "in_world")),
+    "forward kinematics": ((joints, "place_fingers"),),
     "status, expected errors": ((tracker, "hand_pose"),),
     REST: (),
 }

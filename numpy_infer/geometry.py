@@ -214,28 +214,46 @@ def shortest_arc(source: Array, target: Array, share: Array | None = None) -> Ar
     Vectors `[..., 3]` without length turn nothing. Between opposite ones every half turn is least:
     the one about the coordinate axis farthest from them, made perpendicular, is taken.
 
-    Made of two reflections, across the source and across the direction half way to where it goes:
-    no angle has to be known for it.
+    No angle has to be known for it: the sum of the unit quaternions of no turn and of twice the arc
+    has the direction of the arc's own.
     """
-    square, other = _dot(source, source), _dot(target, target)
-    target = target * np.sqrt(square / np.maximum(other, 1e-30))
-    half_way = source + target
-    half_square = _dot(half_way, half_way)
-    # 2 + 2 cos of the angle between them, times the square of their length.
-    if share is not None or (half_square <= 1.5 * square).any():
-        whole = np.ones_like(square[..., 0]) if share is None else share
-        source, half_way, target = _reflected(source, target, whole)
-        square = half_square = np.ones_like(square)
-    turned = target[..., None] * (source / square)[..., None, :]
-    turned -= half_way[..., None] * (half_way / half_square)[..., None, :]
-    turned += turned
-    turned += _EYE.astype(source.dtype, copy=False)
-    return turned
+    ones = _ONES.astype(source.dtype, copy=False)
+    square, other = (source * source) @ ones, (target * target) @ ones
+    lengths = np.sqrt(square * other)
+    turns = _cross_and_dot(source, target)
+    turns[..., 3] += lengths
+    if share is not None or np.count_nonzero(turns[..., 3] <= 0.75 * lengths):
+        whole = np.ones_like(lengths) if share is None else share
+        source, half_way, has_arc = _half_way(source, target, whole)
+        turns = np.where(has_arc, _cross_and_dot(source, half_way), [0, 0, 0, 1])
+        turns = turns.astype(source.dtype, copy=False)
+    products = turns.take(_FOUR_ROWS, -1) * turns.take(_FOUR_COLUMNS, -1)
+    rotation = products @ _WITH_SQUARE.astype(source.dtype, copy=False)
+    return (rotation[..., :9] / rotation[..., 9:]).reshape(*turns.shape[:-1], 3, 3)
 
 
-def _reflected(source: Array, target: Array, share: Array) -> tuple[Array, Array, Array]:
-    """Unit vectors `[..., 3]`: the source, the middle of that share of the arc, and its end; all
-    the source if there is no arc."""
+def _cross_and_dot(a: Array, b: Array) -> Array:
+    """`[..., 4]` cross and scalar product of `[..., 3]`: of unit vectors the quaternion, xyzw, of
+    twice the turn from one to the other."""
+    products = a.take(_ROWS, -1) * b.take(_COLUMNS, -1)
+    return products @ _CROSS_AND_DOT.astype(a.dtype, copy=False)
+
+
+_ONES = np.ones(3)
+_ROWS, _COLUMNS = np.divmod(np.arange(9), 3)
+_FOUR_ROWS, _FOUR_COLUMNS = np.divmod(np.arange(16), 4)
+_CROSS_AND_DOT = np.concatenate(
+    [_CROSS_BASIS.reshape(3, 3, 3).swapaxes(1, 2).reshape(9, 3), _EYE.reshape(9, 1)], 1
+)
+"""`[9, 4]` from the products of two vectors' entries."""
+_WITH_SQUARE = np.concatenate([_OF_PRODUCTS, np.eye(4).reshape(16, 1)], 1)
+"""`[16, 10]` from the products of a quaternion's entries: its rotation times the square of its
+length, and that square."""
+
+
+def _half_way(source: Array, target: Array, share: Array) -> tuple[Array, Array, Array]:
+    """Unit vectors `[..., 3]`: the source, and the middle of that share of the arc; and `[..., 1]`
+    False where there is no arc."""
     has_arc = (_dot(source, source) > 0) & (_dot(target, target) > 0)
     source, target = _direction(source), _direction(target)
     cosine = _dot(source, target)
@@ -247,8 +265,7 @@ def _reflected(source: Array, target: Array, share: Array) -> tuple[Array, Array
     angle = share[..., None] * np.arctan2(sine, cosine) / 2
     # Once more: of nearly opposite ones `aside` is not quite perpendicular.
     half_way = _direction(np.cos(angle) * source + np.sin(angle) * _direction(aside))
-    there = 2 * _dot(half_way, source) * half_way - source
-    return source, *(np.where(has_arc, part, source) for part in (half_way, there))
+    return source, half_way, has_arc
 
 
 def _direction(vector: Array) -> Array:
