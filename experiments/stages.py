@@ -48,6 +48,7 @@ REST = "input checked, and the rest"
 STAGES: dict[str, tuple[tuple[ModuleType, str], ...]] = {
     "gate": ((gate, "step"),),
     "registration, and wrist pose with it": (
+        *((continuity, "sight"), (continuity, "refit")),
         *((continuity, "fit"), (continuity, "pattern"), (continuity, "kabsch")),
     ),
     "marker network": ((predictors, "predict"),),

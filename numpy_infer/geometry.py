@@ -16,6 +16,7 @@ PRIOR_STRENGTH = 1e-6
 """m²: below this second singular value of the cross-covariance (points within about 1 mm of a
 line) the prior decides what the points do not; above it, it has no say at all."""
 
+_FOUR_ROWS, _FOUR_COLUMNS = np.divmod(np.arange(16), 4)
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
@@ -66,6 +67,14 @@ def second_extent(points: Array, weight: Array) -> Array:
     collinear points."""
     centred = (points - _shares(weight) @ points) * np.sqrt(weight)[..., None]
     return np.sqrt(np.maximum(np.linalg.eigvalsh(centred.swapaxes(-1, -2) @ centred)[..., 1], 0))
+
+
+def squares(vectors: Array) -> Array:
+    """`[...]` squares of the lengths of `[..., 3]`."""
+    return (vectors * vectors) @ _ONES.astype(vectors.dtype, copy=False)
+
+
+_ONES = np.ones(3)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -122,6 +131,47 @@ def fit(
     return rotation, (mean - source.mean @ rotation.swapaxes(-1, -2))[..., 0, :], second
 
 
+class Folded(NamedTuple):
+    """Several patterns that one set of points is registered to again and again."""
+
+    shares: Array
+    """`[..., 1, N]` of the first pattern: about their weighted mean points are centred."""
+    table: Array
+    """`[..., 3N, 19K]` from such points: of each of `K` patterns Horn's matrix, and how far its own
+    mean is from there."""
+    mean: Array
+    """`[..., K, 3, 1]` metres: of the patterns' points."""
+
+
+def folded(sources: Array, weights: Array) -> Folded:
+    """Patterns of `sources [K, N, 3]` and `weights [..., K, N]`."""
+    shares, mean, spread = pattern(sources, weights)
+    batch, (count, points) = weights.shape[:-2], sources.shape[:2]
+    # Of the entries of a cross-covariance, target by source, those of Horn's matrix.
+    horn = (spread @ _OF_SOURCE.astype(spread.dtype, copy=False)).reshape(*spread.shape, 16)
+    table = np.zeros((*batch, points, 3, count, 19), spread.dtype)
+    table[..., :16] = horn.swapaxes(-4, -3).swapaxes(-3, -2)
+    for axis in range(3):
+        table[..., axis, :, 16 + axis] = shares[..., 0, :].swapaxes(-1, -2)
+    table = table.reshape(*batch, 3 * points, 19 * count)
+    return Folded(shares[..., 0, :, :], table, mean.swapaxes(-1, -2))
+
+
+def refit(source: Folded, target: Array) -> tuple[Array, Array, Array]:
+    """`fit` of target `[..., N, 3]` to several patterns at once, where no prior is needed: from
+    rotations that come with too small a second singular value, below twice `PRIOR_STRENGTH`,
+    nothing follows. Everything has `K` before its last axes."""
+    mean = source.shares @ target
+    batch, count = target.shape[:-2], source.mean.shape[-3]
+    flat = (target - mean).reshape(*batch, 1, -1) @ source.table
+    entries = flat.reshape(*batch, count, 19)
+    symmetric = entries[..., :16].reshape(*batch, count, 4, 4)
+    values, quaternions = np.linalg.eigh(symmetric)
+    rotation = _rotation(quaternions)
+    translation = mean + entries[..., 16:] - (rotation @ source.mean)[..., 0]
+    return rotation, translation, (values[..., 3] + values[..., 1]) / 2
+
+
 def kabsch(
     source: Array, target: Array, weight: Array, prior: Array | Callable[[], Array]
 ) -> tuple[Array, Array]:
@@ -170,9 +220,9 @@ def _horn(matrix: Array) -> tuple[Array, Array]:
 
 def _rotation(quaternions: Array) -> Array:
     """`[..., 3, 3]` of the last column, a unit quaternion xyzw, of `[..., 4, 4]`."""
-    q = quaternions[..., 3:]
-    products = (q * q.swapaxes(-1, -2)).reshape(*q.shape[:-2], 16)
-    return (products @ _OF_PRODUCTS.astype(q.dtype, copy=False)).reshape(*q.shape[:-2], 3, 3)
+    q = quaternions[..., 3]
+    products = q.take(_FOUR_ROWS, -1) * q.take(_FOUR_COLUMNS, -1)
+    return (products @ _OF_PRODUCTS.astype(q.dtype, copy=False)).reshape(*q.shape[:-1], 3, 3)
 
 
 def _horn_entries() -> Array:
@@ -186,6 +236,8 @@ def _horn_entries() -> Array:
 
 
 _HORN = _horn_entries().reshape(9, 16)
+_OF_SOURCE = _HORN.reshape(3, 3, 16).swapaxes(0, 1).reshape(3, 48)
+"""`[3, 48]` the same from a source's entries: with those of the target, and Horn's matrix."""
 _OF_PRODUCTS = _HORN.T.copy()
 """`[16, 9]` from the products of a quaternion's entries to its rotation: tr(Rᵀ matrix) = qᵀ K q."""
 
@@ -217,9 +269,7 @@ def shortest_arc(source: Array, target: Array, share: Array | None = None) -> Ar
     No angle has to be known for it: the sum of the unit quaternions of no turn and of twice the arc
     has the direction of the arc's own.
     """
-    ones = _ONES.astype(source.dtype, copy=False)
-    square, other = (source * source) @ ones, (target * target) @ ones
-    lengths = np.sqrt(square * other)
+    lengths = np.sqrt(squares(source) * squares(target))
     turns = _cross_and_dot(source, target)
     turns[..., 3] += lengths
     if share is not None or np.count_nonzero(turns[..., 3] <= 0.75 * lengths):
@@ -239,9 +289,7 @@ def _cross_and_dot(a: Array, b: Array) -> Array:
     return products @ _CROSS_AND_DOT.astype(a.dtype, copy=False)
 
 
-_ONES = np.ones(3)
 _ROWS, _COLUMNS = np.divmod(np.arange(9), 3)
-_FOUR_ROWS, _FOUR_COLUMNS = np.divmod(np.arange(16), 4)
 _CROSS_AND_DOT = np.concatenate(
     [_CROSS_BASIS.reshape(3, 3, 3).swapaxes(1, 2).reshape(9, 3), _EYE.reshape(9, 1)], 1
 )

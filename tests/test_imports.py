@@ -28,7 +28,7 @@ TWINS = (
 ONE_SIDED = {
     # What XLA must be told about small matrix products; numpy has `@`.
     # And halves of `kabsch`, for the pipeline of one frame; XLA takes apart what it compiles.
-    "geometry": {"inner", "product", "pattern", "fit"},
+    "geometry": {"inner", "product", "pattern", "fit", "folded", "refit", "squares"},
     # An IMU glove's rotations are no angles; the runtime has its fingers from angles.
     "skeleton": {"align_fingers"},
     # For many frames at once, in `offline`: JAX scans over them.
