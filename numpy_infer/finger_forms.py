@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from numpy_infer.arrays import Array
-from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, POINTS, THUMB_AXES, Hand
+from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, THUMB_AXES, Hand
 
 
 def _axis(letter: str, joint: str) -> list[float]:
@@ -134,46 +134,30 @@ BASE_AXES = JOINT_AXES[::3]
 _BY_AXES = BASE_AXES.swapaxes(-1, -2)[:, None]
 
 
-class WaveSums(NamedTuple):
-    """Of three angles all that are linear in products of 1, cosine and sine are linear in 27 waves,
-    too: sines of sums of those angles."""
-
-    often: Array
-    """`[A, N]` how often each angle is in each sum."""
-    phases: Array
-    """`[N]` radians that are added."""
-
-
-def _sums() -> tuple[WaveSums, Array]:
-    """Those of three angles `[3, 27]`, and `[27, 27]` what they make of such products."""
+def _sums() -> tuple[Array, Array, Array]:
+    """Three angles in `[3, 27]` sums, their phases `[27]`, and `[27, 27]` what the sines of those
+    make of products as above: one base of the same functions, and another."""
     half = [(0, 0, 1), *((0, 1, k) for k in (-1, 0, 1))]
     half += [(1, j, k) for j in (-1, 0, 1) for k in (-1, 0, 1)]
     often, phases = np.array([(0, 0, 0), *half, *half]).T, np.repeat([np.pi / 2, 0], [14, 13])
-    # As many angles as there are products tell them apart.
+    # As many angles as there are functions tell them apart.
     angles = 2 * np.pi / 3 * np.stack(np.meshgrid(*3 * [range(3)]), -1).reshape(27, 3)
     first, second, third = np.stack([np.ones((27, 3)), np.cos(angles), np.sin(angles)]).T
     products = np.einsum("ni,nj,nk->nijk", first, second, third).reshape(27, 27)
-    return WaveSums(often, phases), np.linalg.solve(np.sin(angles @ often + phases), products)
+    return often.astype(float), phases, np.linalg.solve(np.sin(angles @ often + phases), products)
 
 
-_OF_THREE, _PRODUCTS = _sums()
+_OFTEN, _PHASES, _PRODUCTS = _sums()
 
 
-def _of_angles(three: Array) -> WaveSums:
-    """The sums of several threes `[..., 3]` of the hand's angles, one after the other."""
-    often = np.eye(len(ANGLES))[three].swapaxes(-1, -2) @ _OF_THREE.often
-    phases = np.tile(_OF_THREE.phases, three[..., 0].size)
-    return WaveSums(np.moveaxis(often, -2, 0).reshape(len(ANGLES), -1), phases)
+def waves(angles: Array) -> Array:
+    """`[..., 27]` sines of sums of three angles `[..., 3]`, radians: whatever is linear in products
+    of 1, cosine and sine of the three is linear in these, too."""
+    phases = angles.reshape(-1, 3) @ _OFTEN.astype(angles.dtype, copy=False)
+    phases += _PHASES.astype(angles.dtype, copy=False)
+    return np.sin(phases).reshape(*angles.shape[:-1], 27)
 
 
-def waves(angles: Array, sums: WaveSums) -> Array:
-    """`[..., N]` of angles `[..., 26]`, radians."""
-    phases = angles @ sums.often.astype(angles.dtype, copy=False)
-    return np.sin(phases + sums.phases.astype(angles.dtype, copy=False))
-
-
-BEYOND_BASES, BASES_AND_BEYOND = map(_of_angles, (OUTER_ANGLES, FINGER_ANGLES.swapaxes(0, 1)))
-"""The sums of what is beyond the fingers' bases, `N` as `[5, 27]`, and of both, `[2, 5, 27]`."""
 AXES_FORM = _PRODUCTS @ (_BY_AXES @ BASE_FORM.reshape(5, 27, 3, 3) @ BASE_AXES[:, None]).reshape(
     5, 27, 9
 )
@@ -192,9 +176,12 @@ class FingerWaves(NamedTuple):
     """`[5, 27, 3]` m², of the same waves: the square of that marker's distance from the base, and
     its slopes by the two flexions."""
     bases: Array
-    """`[21, 3]` metres, hand frame: the base of each point's finger."""
+    """`[5, 3, 13]` metres: what is added to those but for the marker once the base is turned, by
+    the same axes: to points the base, to rotations nothing."""
     base_by_axes: Array
     """`[15]` metres: the bases, each by its finger's axes."""
+    bare: Array | None
+    """`[5, 1]` True for a finger without a marker; None if all have one."""
     ends: Array
     """`[3M, 15]` from all markers to the outermost of each finger, by its axes."""
 
@@ -213,14 +200,16 @@ def finger_waves(hand: Hand) -> FingerWaves:
     ends = np.zeros((len(hand), 3, 5, 3))
     for finger, (end, has) in enumerate(zip(*hand.end_markers, strict=True)):
         ends[end, :, finger] = has * BASE_AXES[finger]
-    bases = np.zeros((len(POINTS), 3))
-    for chain, own in zip(CHAINS, base, strict=True):
-        bases[list(chain)] = own
+    base = (base[:, None] @ BASE_AXES)[:, 0]
+    bases = np.zeros((5, 3, 13))
+    bases[..., 9:] = base[..., None]
+    bare = hand.end_markers[1][:, None] == 0
     return FingerWaves(
         beyond=_PRODUCTS @ beyond.reshape(5, 27, 42),
         square=_PRODUCTS @ np.stack([square, by_first, by_last], -1).reshape(5, 27, 3),
         bases=bases,
-        base_by_axes=(base[:, None] @ BASE_AXES).reshape(15),
+        base_by_axes=base.reshape(15),
+        bare=bare if bare.any() else None,
         ends=ends.reshape(-1, 15),
     )
 

@@ -4,23 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from numpy_infer.arrays import Array
+from numpy_infer.arrays import Array, every
 from numpy_infer.finger_forms import (
     AXES_FORM,
     BASE_ANGLES,
     BASE_AXES,
-    BASES_AND_BEYOND,
-    BEYOND_BASES,
     CROSS,
     CROSS_SQUARED,
+    FINGER_ANGLES,
     FLEXIONS,
     JOINT_AXES,
+    OUTER_ANGLES,
     SIGNS,
     FingerWaves,
     finger_waves,
     waves,
 )
-from numpy_infer.geometry import shortest_arc, transform
+from numpy_infer.geometry import shortest_arc, squares, transform
 from numpy_infer.hand import ANGLES, JOINTS, POINTS, Hand
 
 _BY_JOINT = [[i for i, a in enumerate(ANGLES) if a.joint == joint] for joint in JOINTS[1:]]
@@ -72,9 +72,12 @@ def angles_from_rotations(rotations: Array) -> Array:
     dtype = rotations.dtype
     axes = JOINT_AXES.astype(dtype, copy=False)
     turns = axes.swapaxes(-1, -2) @ rotations @ axes
-    return _euler(turns)[..., *EULER] * SIGNS.astype(dtype, copy=False)
+    return _euler(turns)[..., *EULER] * _SIGNS.astype(dtype, copy=False)
 
 
+_OF_AXES = np.array([-1, 1, -1])
+_SIGNS = SIGNS * _OF_AXES[EULER[1]]
+"""`[26]` of what `_euler` gives."""
 _SURELY_TOLD = 0.99
 """Sine of the middle angle: up to here the first and the last are told apart well."""
 _OPPOSITE, _ADJACENT = np.array([5, 1]), np.array([8, 0])
@@ -83,22 +86,21 @@ cosine of the middle one."""
 
 
 def _euler(rotations: Array) -> Array:
-    """`[..., 3]` radians about x, y and z, in that order, of `[..., 3, 3]`."""
+    """`[..., 3]` radians about −x, y and −z, in that order, of `[..., 3, 3]`."""
     euler = np.empty(rotations.shape[:-1], rotations.dtype)
     flat = rotations.reshape(*rotations.shape[:-2], 9)
-    if np.count_nonzero(np.abs(flat[..., 2]) < _SURELY_TOLD) == euler[..., 1].size:
-        sides = flat.take(_OPPOSITE, -1), flat.take(_ADJACENT, -1)
-        np.negative(np.arctan2(*sides), out=euler[..., ::2])
+    if every(np.abs(flat[..., 2]) < _SURELY_TOLD):
+        np.arctan2(flat.take(_OPPOSITE, -1), flat.take(_ADJACENT, -1), out=euler[..., ::2])
         np.arcsin(flat[..., 2], out=euler[..., 1])
         return euler
     # The latter two of what the first leaves (Day 2012): near ±90° about y, where the first is
     # hardly known, they make up for it.
     m = rotations
-    euler[..., 0] = about_x = np.arctan2(-m[..., 1, 2], m[..., 2, 2])
+    euler[..., 0] = about_x = np.arctan2(m[..., 1, 2], m[..., 2, 2])
     cosine, sine = np.cos(about_x), np.sin(about_x)
-    left = cosine[..., None] * m[..., 1, :2] + sine[..., None] * m[..., 2, :2]
-    euler[..., 1] = np.arctan2(m[..., 0, 2], cosine * m[..., 2, 2] - sine * m[..., 1, 2])
-    euler[..., 2] = np.arctan2(left[..., 0], left[..., 1])
+    left = cosine[..., None] * m[..., 1, :2] - sine[..., None] * m[..., 2, :2]
+    euler[..., 1] = np.arctan2(m[..., 0, 2], cosine * m[..., 2, 2] + sine * m[..., 1, 2])
+    euler[..., 2] = -np.arctan2(left[..., 0], left[..., 1])
     return euler
 
 
@@ -186,18 +188,18 @@ def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
         `[..., 26]` radians.
     """
     fingers, dtype = finger_waves(hand), angles.dtype
-    beyond = waves(angles, BEYOND_BASES).reshape(*angles.shape[:-1], 5, 1, 27)
-    form = (beyond @ fingers.square.astype(dtype, copy=False))[..., 0, :]
+    beyond = waves(angles.take(OUTER_ANGLES, -1))
+    form = (beyond[..., None, :] @ fingers.square.astype(dtype, copy=False))[..., 0, :]
     # Of squares, their slopes too, so that no distance is divided by. No marker: no slope.
     square, slopes = np.maximum(form[..., :1], NEAREST**2), form[..., 1:]
     target = _towards(fingers, markers)
-    short = np.sqrt(square * ((target * target) @ _SUM.astype(dtype, copy=False))) - square
+    short = np.sqrt(square * squares(target)[..., None]) - square
     damped = (slopes * slopes) @ _HALF_SUM.astype(dtype, copy=False) + _DAMPING * square
     bend = np.minimum(np.maximum(slopes * (short / damped), -FARTHEST_BEND), FARTHEST_BEND)
     return angles + bend.reshape(*angles.shape[:-1], 10) @ _BENT.astype(dtype, copy=False)
 
 
-_SUM, _HALF_SUM = np.ones((3, 1)), np.full((2, 1), 0.5)
+_HALF_SUM = np.full((2, 1), 0.5)
 _DAMPING = 2 * (BEND_NOISE / BEND_PRIOR) ** 2
 _BENT = np.eye(len(ANGLES))[FLEXIONS.reshape(10)]
 """`[10, 26]` all angles from the flexions."""
@@ -233,15 +235,15 @@ def place_fingers(
     """
     batch, dtype = angles.shape[:-1], angles.dtype
     fingers = finger_waves(hand)
-    both = waves(angles, BASES_AND_BEYOND).reshape(*batch, 2, 5, 1, 27)
-    turn = both[..., 0, :, :, :] @ AXES_FORM.astype(dtype, copy=False)
-    own = both[..., 1, :, :, :] @ fingers.beyond.astype(dtype, copy=False)
+    both = waves(angles.take(FINGER_ANGLES, -1))
+    turn = both[..., :1, :] @ AXES_FORM.astype(dtype, copy=False)
+    own = both[..., 1:, :] @ fingers.beyond.astype(dtype, copy=False)
     turn, own = turn.reshape(*batch, 5, 3, 3), own.reshape(*batch, 5, 3, 14)
     if markers is not None:
         modelled = (turn @ own[..., 13:])[..., 0]
-        measured, has = _towards(fingers, markers), hand.end_markers[1]
-        if np.count_nonzero(has) < has.size:
-            measured = np.where(has[:, None] > 0, measured, modelled)
+        measured = _towards(fingers, markers)
+        if fingers.bare is not None:
+            measured = np.where(fingers.bare, modelled, measured)
         turn = shortest_arc(modelled, measured) @ turn
         base_angles = _euler(turn) * _BASE_SIGNS.astype(dtype, copy=False)
         angles = np.concatenate([angles, base_angles.reshape(*batch, 15)], -1)
@@ -250,11 +252,12 @@ def place_fingers(
         wrist_rotation = np.broadcast_to(_EYE.astype(dtype, copy=False), (*batch, 3, 3))
         wrist_position = np.zeros((*batch, 3), dtype)
     axes = wrist_rotation[..., None, :, :] @ BASE_AXES.astype(dtype, copy=False)
-    placed = axes @ (turn @ own[..., :13])
-    parts = wrist_rotation.reshape(*batch, 9), placed.reshape(*batch, 195)
-    everything = np.concatenate(parts, -1)
-    bases = transform(wrist_rotation, wrist_position, fingers.bases.astype(dtype, copy=False))
-    return angles, bases + everything.take(_POINTS, -1), everything.take(_ROTATIONS, -1)
+    placed = turn @ own[..., :13] + fingers.bases.astype(dtype, copy=False)
+    placed = (axes @ placed).reshape(*batch, 195)
+    wrist = wrist_rotation.reshape(*batch, 9)
+    everything = np.concatenate([np.zeros((*batch, 3), dtype), wrist, placed], -1)
+    positions = everything.take(_POINTS, -1) + wrist_position[..., None, :]
+    return angles, positions, everything.take(_ROTATIONS, -1)
 
 
 def _towards(fingers: FingerWaves, markers: Array) -> Array:
@@ -266,20 +269,21 @@ def _towards(fingers: FingerWaves, markers: Array) -> Array:
     return ends.reshape(*flat.shape[:-1], 5, 3)
 
 
-_BASE_SIGNS = SIGNS[BASE_ANGLES]
+_BASE_SIGNS = SIGNS[BASE_ANGLES] * _OF_AXES
 _WITH_BASE_ANGLES = np.arange(len(ANGLES))
 _WITH_BASE_ANGLES[BASE_ANGLES] = len(ANGLES) + np.arange(15).reshape(5, 3)
 """`[26]` places in all angles, with those of the bases as they are to be behind them."""
-_PLACED = 9 + np.arange(5 * 3 * 13).reshape(5, 3, 13)
-"""Places, behind the wrist's rotation, of what `place_fingers` makes of `FingerWaves.beyond`."""
-_ROTATIONS = np.arange(9).reshape(1, 3, 3)
+_PLACED = 12 + np.arange(5 * 3 * 13).reshape(5, 3, 13)
+"""Places, behind the wrist's own and its rotation, of what `place_fingers` makes of
+`FingerWaves.beyond`."""
+_ROTATIONS = 3 + np.arange(9).reshape(1, 3, 3)
 _ROTATIONS = np.concatenate(
     [_ROTATIONS, _PLACED[..., :9].reshape(5, 3, 3, 3).swapaxes(1, 2).reshape(15, 3, 3)]
 )
-"""`[16, 3, 3]`, and of points from their finger's base `[21, 3]`: the wrist has none to be from."""
+"""`[16, 3, 3]`, and of points `[21, 3]`, in the world but for the wrist's position."""
 _POINTS = np.concatenate(
     [
-        _PLACED[:1, :, 9],
+        np.arange(3)[None],
         _PLACED[..., 9:12].swapaxes(1, 2).reshape(15, 3),
         _PLACED[..., 12],
     ]
