@@ -235,7 +235,9 @@ def place_fingers(
     """
     batch, dtype = angles.shape[:-1], angles.dtype
     fingers = finger_waves(hand)
-    both = waves(angles.take(FINGER_ANGLES, -1))
+    # Sums of angles that are no hand's would be rounded apart, and no rotation come of them.
+    small = np.fmod(angles, _WHOLE_TURN.astype(dtype, copy=False))
+    both = waves(small.take(FINGER_ANGLES, -1))
     turn = both[..., :1, :] @ AXES_FORM.astype(dtype, copy=False)
     own = both[..., 1:, :] @ fingers.beyond.astype(dtype, copy=False)
     turn, own = turn.reshape(*batch, 5, 3, 3), own.reshape(*batch, 5, 3, 14)
@@ -269,6 +271,7 @@ def _towards(fingers: FingerWaves, markers: Array) -> Array:
     return ends.reshape(*flat.shape[:-1], 5, 3)
 
 
+_WHOLE_TURN = np.array(2 * np.pi)
 _BASE_SIGNS = SIGNS[BASE_ANGLES] * _OF_AXES
 _WITH_BASE_ANGLES = np.arange(len(ANGLES))
 _WITH_BASE_ANGLES[BASE_ANGLES] = len(ANGLES) + np.arange(15).reshape(5, 3)
