@@ -187,7 +187,7 @@ def _unsteady(
     now, sure, wrist = _registration(seen, markers)
     plain = every(sure)
     tracking = sure if plain else second_extent(markers, weight) > DETERMINED_EXTENT
-    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
+    changed = np.logical_or.reduce(visible != state.visible, -1) | (tracking != state.tracking)
     known = visible[..., None]
 
     def shift() -> Array:
@@ -210,7 +210,7 @@ def _unsteady(
 
     rotations, translations, second = refit(seen.template, previous)
     then = rotations[..., 0, :, :], translations[..., 0, :]
-    if not plain or second.min() <= 2 * PRIOR_STRENGTH:
+    if not plain or not every(second > 2 * PRIOR_STRENGTH):
         both = np.stack([markers, previous])
         rotations, translations, _ = fit(pattern(template, weight), both, priors)
         now, then = ((rotations[i], translations[i]) for i in (0, 1))
@@ -236,7 +236,7 @@ def _unsteady(
         advance, both, raw, exact = _fill(
             model, state.predictor, measured, markers, visible, last, dt, now, now
         )
-        registered, again = both
+        registered, again = both[0], both[1]
     else:
         earlier = _registration_before(state, then, changed, now)
         advance, registered, raw, exact = _fill(
@@ -258,7 +258,7 @@ def _unsteady(
     anchor, prior = measured[1], then[0].swapaxes(-1, -2) @ followed
     carried = untransform(*now, transform(turn, move, before))
     drift = np.where(state.visible, 0, state.drift + state.change[..., None])
-    if not (certain and changed.all()):
+    if not (certain and every(changed)):
         # Hands whose set is the same go on as they were; those seen for the first time begin.
         restart, begin = (changed & state.tracked)[..., None, None], ~tracked
         correction = np.where(begin, 0, np.where(restart, correction, state.correction))

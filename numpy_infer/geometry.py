@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numpy_infer.arrays import Array
+from numpy_infer.arrays import Array, some
 
 PRIOR_STRENGTH = 1e-6
 """m²: below this second singular value of the cross-covariance (points within about 1 mm of a
@@ -59,7 +59,8 @@ def mean_point(points: Array, weight: Array) -> Array:
 
 def _shares(weight: Array) -> Array:
     """`[..., 1, N]` weights as parts of their sum; 0 where all are 0."""
-    return (weight / np.maximum(weight.sum(-1, keepdims=True), 1e-30))[..., None, :]
+    total = np.add.reduce(weight, -1, keepdims=True)
+    return (weight / np.maximum(total, 1e-30))[..., None, :]
 
 
 def second_extent(points: Array, weight: Array) -> Array:
@@ -124,7 +125,7 @@ def fit(
     values, quaternions = _horn(covariance)
     second = (values[..., 3] + values[..., 1]) / 2
     # Twice is enough: `prior_weight` measures at least 1/√3 of it.
-    if (second < 2 * PRIOR_STRENGTH).any():
+    if some(second < 2 * PRIOR_STRENGTH):
         prior = prior() if callable(prior) else prior
         _, quaternions = _horn(covariance + prior_weight(covariance)[..., None, None] * prior)
     rotation = _rotation(quaternions)
