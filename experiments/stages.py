@@ -48,6 +48,7 @@ REST = "input checked, and the rest"
 STAGES: dict[str, tuple[tuple[ModuleType, str], ...]] = {
     "gate": ((gate, "step"),),
     "registration, and wrist pose with it": (
+        *((continuity, "sight"), (continuity, "refit")),
         *((continuity, "fit"), (continuity, "pattern"), (continuity, "kabsch")),
     ),
     "marker network": ((predictors, "predict"),),
@@ -61,7 +62,7 @@ STAGES: dict[str, tuple[tuple[ModuleType, str], ...]] = {
     "finger alignment": (
         *((joints, "bend_fingers"), (skeleton, "shortest_arc"), (skeleton, "_euler")),
     ),
-    "forward kinematics": ((joints, "place_fingers"), (joints, "in_world")),
+    "forward kinematics": ((joints, "place_fingers"),),
     "status, expected errors": ((tracker, "hand_pose"),),
     REST: (),
 }

@@ -20,6 +20,7 @@ import numpy as np
 from jaxhand.anthropometry import People
 from jaxhand.compiled import apart
 from numpy_infer.arrays import Array
+from numpy_infer.finger_forms import JOINT_AXES, SIGNS
 from numpy_infer.hand import (
     ANGLES,
     ANGLES_OF_FINGER,
@@ -33,7 +34,7 @@ from numpy_infer.hand import (
     SLOT_OF_ANGLE,
     Hand,
 )
-from numpy_infer.skeleton import EULER, JOINT_AXES, SIGNS
+from numpy_infer.skeleton import EULER
 
 BONES = POINTS[1:]
 """The 20 capsules, each named for the point in which its bone ends."""

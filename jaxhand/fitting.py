@@ -18,6 +18,7 @@ import numpy as np
 from jaxhand.geometry import product, solve
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
+from numpy_infer.finger_forms import JOINT_AXES
 from numpy_infer.hand import (
     ANGLES,
     ANGLES_OF_FINGER,
@@ -31,7 +32,6 @@ from numpy_infer.hand import (
     POINTS,
     SLOT_OF_ANGLE,
 )
-from numpy_infer.skeleton import JOINT_AXES
 
 ITERATIONS = 100
 TOLERANCE = 1e-4

@@ -23,8 +23,8 @@ from jaxhand.skeleton import (
     rotations_from_angles,
 )
 from numpy_infer.arrays import Array
+from numpy_infer.finger_forms import JOINT_AXES, SIGNS
 from numpy_infer.hand import ANGLES, FINGERS, JOINTS, Hand
-from numpy_infer.skeleton import JOINT_AXES, SIGNS
 
 SWEEPS = 100
 """Markers within reach are then within 1 mm, and ten times as many change Table 4 by 1 to 2 %."""

@@ -13,7 +13,6 @@ from jaxhand.skeleton import (
     angles_from_rotations,
     bend_fingers,
     flat_calibrated,
-    in_world,
     place_fingers,
     rotations_from_angles,
 )
@@ -51,8 +50,7 @@ def joint_stage(model: Model, markers: Array, rotation: Array, position: Array) 
     if model.alignment:
         angles = bend_fingers(model.body, angles, own)
     towards = own if model.alignment else None
-    angles, positions, rotations = place_fingers(model.body, angles, towards)
-    positions, rotations = in_world(positions, rotations, rotation, position)
+    angles, positions, rotations = place_fingers(model.body, angles, towards, rotation, position)
     return {
         "angles": angles,
         "rotations": rotations,

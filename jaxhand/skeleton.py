@@ -8,24 +8,20 @@ import numpy as np
 from jaxhand.compiled import apart
 from jaxhand.geometry import product, shortest_arc, transform
 from numpy_infer.arrays import Array
-from numpy_infer.hand import CHAINS, JOINTS, Hand
-from numpy_infer.skeleton import (
+from numpy_infer.finger_forms import (
     BASE_ANGLES,
     BASE_FORM,
-    BEND_NOISE,
-    BEND_PRIOR,
     CROSS,
     CROSS_SQUARED,
-    EULER,
-    FARTHEST_BEND,
     FINGER_ANGLES,
     FLEXIONS,
     JOINT_AXES,
     OUTER_ANGLES,
     SIGNS,
-    SLOTS,
     finger_forms,
 )
+from numpy_infer.hand import CHAINS, JOINTS, Hand
+from numpy_infer.skeleton import BEND_NOISE, BEND_PRIOR, EULER, FARTHEST_BEND, SLOTS
 
 
 def rotations_from_angles(angles: Array) -> Array:
@@ -171,7 +167,11 @@ def align_fingers(
 
 
 def place_fingers(
-    hand: Hand, angles: Array, markers: Array | None = None
+    hand: Hand,
+    angles: Array,
+    markers: Array | None = None,
+    wrist_rotation: Array | None = None,
+    wrist_position: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """All points of a hand with its fingers at `angles`, and turned about their bases until their
     outermost markers point to where they were measured (paper, section 2.2: finger alignment).
@@ -184,10 +184,12 @@ def place_fingers(
         hand: its markers and bones.
         angles: `[..., 26]` radians.
         markers: `[..., M, 3]` metres, hand frame; None turns nothing.
+        wrist_rotation: `[..., 3, 3]` world_from_wrist; without it all is in the hand frame.
+        wrist_position: `[..., 3]` metres, world.
 
     Returns:
-        angles `[..., 26]` as they now are; positions `[..., 21, 3]` metres and rotations
-        `[..., 16, 3, 3]`, hand frame.
+        angles `[..., 26]` as they now are; positions `[..., 21, 3]` metres, world; rotations
+        `[..., 16, 3, 3]` world_from_joint.
     """
     batch, dtype = angles.shape[:-1], angles.dtype
     ends, has = hand.end_markers
@@ -209,7 +211,10 @@ def place_fingers(
     positions = jnp.concatenate([wrist, inner, joints[..., 3, :]], -2)
     turns = jnp.stack([turn, placed[..., 3:6], placed[..., 6:]], -3).reshape(*batch, 15, 3, 3)
     eye = jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*batch, 1, 3, 3))
-    return angles, positions, jnp.concatenate([eye, turns], -3)
+    rotations = jnp.concatenate([eye, turns], -3)
+    if wrist_rotation is None or wrist_position is None:
+        return angles, positions, rotations
+    return angles, *in_world(positions, rotations, wrist_rotation, wrist_position)
 
 
 def _waves(angles: Array) -> Array:

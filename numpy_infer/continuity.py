@@ -11,28 +11,30 @@ previous output becomes the correction; so the output goes on from where it was.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from numpy_infer import gate
-from numpy_infer.arrays import Array
+from numpy_infer.arrays import Array, every, some
 from numpy_infer.geometry import (
-    Pattern,
+    PRIOR_STRENGTH,
     fit,
     kabsch,
     mean_point,
     pattern,
+    refit,
     second_extent,
+    squares,
     transform,
     untransform,
 )
-from numpy_infer.hand import Hand
 from numpy_infer.model import Model
 from numpy_infer.output import leading, wrist_pose
 from numpy_infer.pose import DETERMINED_EXTENT, State
 from numpy_infer.predictors import PREDICTORS
+from numpy_infer.sight import Sight, sight
 
 SHRINK_SPEED = 0.25
 """m/s at which the correction of a visible marker dies (paper, section 3.2.2)."""
@@ -58,15 +60,16 @@ def advance(
         own, accepted = gate.step(
             model, state.gate, markers, visible, state.output, state.tracked, dt
         )
-        markers = np.where(accepted[..., None], markers, 0)
-    weight = accepted.astype(markers.dtype)
-    frame = _steady(model, state, markers, accepted, weight, dt)
+        if accepted is not visible:
+            markers = np.where(accepted[..., None], markers, 0)
+    seen = sight(model.hand, model.body, accepted, markers.dtype)
+    frame = _steady(model, state, markers, accepted, seen, dt)
     if frame is None:
-        frame = _unsteady(model, state, markers, accepted, weight, dt)
-    new_state = blended(model, state, frame, markers, accepted, weight, dt)
+        frame = _unsteady(model, state, markers, accepted, seen, dt)
+    new_state = blended(model, state, frame, markers, accepted, seen.weight, dt)
     if model.gate:
         new_state = new_state._replace(gate=own, rejected=visible & ~accepted)
-    if np.count_nonzero(late):
+    if some(late):
         same = (accepted == state.visible).all(-1) & (markers == state.markers).all((-1, -2))
         new_state = choose(late & state.known.any(-1) & same, state, new_state)
     return new_state
@@ -83,20 +86,21 @@ def blended(
 ) -> State:
     """The state after a frame: output and wrist, with corrections added."""
     correction, placed, exact = frame.correction, frame.registered, frame.exact
-    change = posture_change(frame, visible, weight)
     if model.continuity and np.count_nonzero(correction):
-        correction, added = blend(model, correction, frame.tracking, change, visible, weight, dt)
+        correction, added, stays = blend(
+            model, correction, frame.tracking, frame.change, visible, weight, dt
+        )
         placed = placed + added
-        exact = exact & (added == 0).all(-1)
+        exact = exact & stays
     output = frame.raw
-    if not exact.all():
+    if np.count_nonzero(exact) < exact.size:
         moved = transform(frame.rotation, frame.translation, placed)
         output = np.where(exact[..., None], output, moved)
     rotation, position = frame.wrist or wrist_pose(model, output, frame.rotation)
     return State(
         right=state.right,
         gate=state.gate,
-        rejected=np.zeros_like(visible),
+        rejected=np.zeros(visible.shape, bool),
         predictor=frame.predictor,
         smoothing=state.smoothing,
         output=output,
@@ -114,7 +118,7 @@ def blended(
         anchor=frame.anchor,
         prior=frame.prior,
         drift=frame.drift,
-        change=change,
+        change=frame.change,
     )
 
 
@@ -131,6 +135,7 @@ class Frame(NamedTuple):
     anchor: Array
     prior: Array
     drift: Array
+    change: Array
     registered: Array
     """`[..., M, 3]` registered frame: measured where visible, else predicted or held."""
     raw: Array
@@ -141,42 +146,20 @@ class Frame(NamedTuple):
 
 
 def _steady(
-    model: Model, state: State, markers: Array, visible: Array, weight: Array, dt: Array
+    model: Model, state: State, markers: Array, visible: Array, seen: Sight, dt: Array
 ) -> Frame | None:
     """The frame if every hand is tracked and sees the markers of the frame before, as in most
     frames; else None."""
-    hand, tracking = model.hand, state.tracking
-    if np.count_nonzero(visible != state.visible) or np.count_nonzero(tracking) < tracking.size:
+    tracking = state.tracking
+    if np.count_nonzero(visible != state.visible) or not every(tracking):
         return None
-    rotations, translations, second = fit(
-        _patterns(model.hand, model.body, markers.dtype.char, visible.shape, visible.tobytes()),
-        markers,
-        lambda: np.stack(
-            np.broadcast_arrays(_carried_prior(state, markers, weight), state.rotation)
-        ),
-    )
-    # The markers' own second singular value is at least that over the template's first.
-    if second[0].min() <= DETERMINED_EXTENT * hand.extent:
+    registration, sure, wrist = _registration(seen, markers)
+    if not every(sure):
         return None
-    registration = rotations[0], translations[0]
     before = state.rotation, state.translation
-    registered = untransform(*registration, markers)
-    # Not if one of its markers is hidden, or on its way to where it is measured.
-    direct = (
-        np.count_nonzero(visible[..., hand.aligned]) == hand.aligned.size * visible[..., 0].size
-    )
-    if direct and np.count_nonzero(state.correction):
-        direct = not np.count_nonzero(state.correction[..., hand.aligned, :])
+    own = untransform(*registration, markers)
     advance, registered, raw, exact = _fill(
-        model,
-        state.predictor,
-        registered,
-        markers,
-        visible,
-        state.output,
-        dt,
-        registration,
-        before,
+        model, state.predictor, own, markers, visible, state.output, dt, registration, before
     )
     return Frame(
         advance,
@@ -187,34 +170,30 @@ def _steady(
         state.anchor,
         state.prior,
         state.drift,
+        posture_change(own, state.anchor, seen.parts),
         registered,
         raw,
         exact,
-        (rotations[1], translations[1]) if direct else None,
+        wrist if _measured(model, state.correction) else None,
     )
 
 
-@lru_cache(maxsize=64)
-def _patterns(hand: Hand, body: Hand, dtype: str, shape: tuple[int, ...], seen: bytes) -> Pattern:
-    """What a visible set `[..., M]` is registered to, frame after frame: the template by its
-    markers and, for the wrist's pose, the body's by the alignment markers."""
-    visible = np.frombuffer(seen, bool).reshape(shape)
-    weights = np.empty((2, *shape), dtype)
-    weights[0], weights[1] = visible, hand.alignment_weight
-    templates = np.array([hand.template, body.template], dtype)
-    return pattern(templates.reshape(2, *(1,) * (len(shape) - 1), *templates.shape[1:]), weights)
-
-
 def _unsteady(
-    model: Model, state: State, markers: Array, visible: Array, weight: Array, dt: Array
+    model: Model, state: State, markers: Array, visible: Array, seen: Sight, dt: Array
 ) -> Frame:
     """Any frame. The one before is done again with this frame's visible set: a marker hidden then
     takes its position of now, carried back by the hand's motion since."""
-    template = model.hand.template.astype(markers.dtype, copy=False)
-    tracking = second_extent(markers, weight) > DETERMINED_EXTENT
-    changed = (visible != state.visible).any(-1) | (tracking != state.tracking)
-    shift = mean_point(markers - state.markers, (visible & state.visible).astype(markers.dtype))
+    template, weight = model.hand.template.astype(markers.dtype, copy=False), seen.weight
+    now, sure, wrist = _registration(seen, markers)
+    plain = every(sure)
+    tracking = sure if plain else second_extent(markers, weight) > DETERMINED_EXTENT
+    changed = np.logical_or.reduce(visible != state.visible, -1) | (tracking != state.tracking)
     known = visible[..., None]
+
+    def shift() -> Array:
+        """What the markers seen in both frames have gone, on average."""
+        both = (visible & state.visible).astype(markers.dtype)
+        return mean_point(markers - state.markers, both)
 
     was_seen = state.visible[..., None]
     before = transform(state.rotation, state.translation, state.seen)
@@ -229,33 +208,35 @@ def _unsteady(
         carried = _carried_prior(state, markers, weight)
         return np.stack([np.where(changed[..., None, None], state.rotation, carried), followed])
 
-    rotations, translations, _ = fit(
-        pattern(template, weight), np.stack([markers, previous]), priors
-    )
-    sure, tracked = tracking[..., None, None], state.tracked[..., None, None]
-    certain = np.count_nonzero(tracking & state.tracked) == tracking.size
+    rotations, translations, second = refit(seen.template, previous)
+    then = rotations[..., 0, :, :], translations[..., 0, :]
+    if not plain or not every(second > 2 * PRIOR_STRENGTH):
+        both = np.stack([markers, previous])
+        rotations, translations, _ = fit(pattern(template, weight), both, priors)
+        now, then = ((rotations[i], translations[i]) for i in (0, 1))
+    determined, tracked = tracking[..., None, None], state.tracked[..., None, None]
+    certain = every(tracking) and every(state.tracked)
     if not certain:
         start = mean_point(markers, weight) - mean_point(template, weight)
         start = np.where(visible.any(-1, keepdims=True), start, state.translation)
-        moved = np.where(state.tracked[..., None], state.translation + shift, start)
-        moved = np.stack([moved, state.translation])
-        rotations = np.where(sure, rotations, state.rotation)
-        translations = np.where(tracking[..., None], translations, moved)
-    now, then = ((rotations[i], translations[i]) for i in (0, 1))
+        moved = np.where(state.tracked[..., None], state.translation + shift(), start)
+        now = choose(tracking, now, (state.rotation, moved))
+        then = choose(tracking, then, (state.rotation, state.translation))
     last = held = state.output
     if not certain:
         # Before there was any output the template stands in for it.
         placed = transform(*now, template)
         last = np.where(tracked, last, placed)
-        held = np.where(tracked, last + shift[..., None, :], placed)
+        held = np.where(tracked, last + shift()[..., None, :], placed)
 
-    measured = untransform(rotations, translations, np.stack([markers, previous]))
+    measured = np.empty((2, *markers.shape), markers.dtype)
+    measured[0], measured[1] = untransform(*now, markers), untransform(*then, previous)
     if PREDICTORS[model.predictor].of_frame is not None:
         # Both frames in one product per layer of the network.
         advance, both, raw, exact = _fill(
             model, state.predictor, measured, markers, visible, last, dt, now, now
         )
-        registered, again = both
+        registered, again = both[0], both[1]
     else:
         earlier = _registration_before(state, then, changed, now)
         advance, registered, raw, exact = _fill(
@@ -267,39 +248,66 @@ def _unsteady(
         )
     correction = untransform(*then, last) - again
     if not certain:
-        registered = np.where(sure | known, registered, untransform(*now, held))
-        raw = np.where(sure | known, raw, held)
-        correction = np.where(sure | known, correction, 0)
+        registered = np.where(determined | known, registered, untransform(*now, held))
+        raw = np.where(determined | known, raw, held)
+        correction = np.where(determined | known, correction, 0)
 
-    length = np.sqrt((correction * correction).sum(-1, keepdims=True))
-    correction = np.where(length < FARTHEST_CORRECTION, correction, 0)
+    near = squares(correction) < FARTHEST_CORRECTION**2
+    if np.count_nonzero(near) < near.size:
+        correction = np.where(near[..., None], correction, 0)
     anchor, prior = measured[1], then[0].swapaxes(-1, -2) @ followed
-    seen = untransform(*now, transform(turn, move, before))
+    carried = untransform(*now, transform(turn, move, before))
     drift = np.where(state.visible, 0, state.drift + state.change[..., None])
-    if not (certain and changed.all()):
+    if not (certain and every(changed)):
         # Hands whose set is the same go on as they were; those seen for the first time begin.
         restart, begin = (changed & state.tracked)[..., None, None], ~tracked
         correction = np.where(begin, 0, np.where(restart, correction, state.correction))
         anchor = np.where(begin, registered, np.where(restart, anchor, state.anchor))
-        seen = np.where(restart & sure, seen, np.where(begin & ~known, template, state.seen))
+        carried = np.where(
+            restart & determined, carried, np.where(begin & ~known, template, state.seen)
+        )
         at_first = now[0].swapaxes(-1, -2) @ state.rotation
         prior = np.where(restart, prior, np.where(begin, at_first, state.prior))
         drift = np.where(changed[..., None], drift, state.drift)
-    drift = drift + np.where(tracking, 0, DRIFT_UNSEEN * dt)[..., None]
+    if not certain:
+        drift = drift + np.where(tracking, 0, DRIFT_UNSEEN * dt)[..., None]
+        exact = exact | ~tracking[..., None]
     drift = np.where(visible, 0, drift).astype(markers.dtype, copy=False)
     return Frame(
         advance,
         tracking,
         *now,
-        seen,
+        carried,
         correction,
         anchor,
         prior,
         drift,
+        posture_change(registered, anchor, seen.parts),
         registered,
         raw,
-        exact | ~tracking[..., None],
-        None,
+        exact,
+        wrist if _measured(model, correction) else None,
+    )
+
+
+def _registration(
+    seen: Sight, markers: Array
+) -> tuple[tuple[Array, Array], Array, tuple[Array, Array] | None]:
+    """The template's rotation and translation by the visible markers; `[...]` True where those
+    surely determine the hand: else a prior is missing. And the wrist's pose, if its markers are
+    visible and determine it."""
+    rotations, translations, second = refit(seen.both, markers)
+    enough = second > seen.least[: second.shape[-1]]
+    wrist = None
+    if seen.direct and every(enough):
+        wrist = rotations[..., 1, :, :], translations[..., 1, :]
+    return (rotations[..., 0, :, :], translations[..., 0, :]), enough[..., 0], wrist
+
+
+def _measured(model: Model, correction: Array) -> bool:
+    """True if no alignment marker, where visible, is on its way to where it is measured."""
+    return not (
+        np.count_nonzero(correction) and np.count_nonzero(correction.take(model.hand.aligned, -2))
     )
 
 
@@ -332,7 +340,7 @@ def _fill(
     """
     chosen = PREDICTORS[model.predictor]
     if chosen.of_frame is not None:
-        if not visible.all():
+        if np.count_nonzero(visible) < visible.size:
             said = chosen.of_frame(model, registered, visible)
             registered = np.where(visible[..., None], registered, said)
         return predictor, registered, markers, visible
@@ -352,7 +360,12 @@ def _registration_before(
 
 
 def _motion(
-    state: State, before: Array, markers: Array, visible: Array, tracking: Array, shift: Array
+    state: State,
+    before: Array,
+    markers: Array,
+    visible: Array,
+    tracking: Array,
+    shift: Callable[[], Array],
 ) -> tuple[Array, Array]:
     """The hand's rigid motion since the previous frame, from the markers seen in both.
 
@@ -371,10 +384,10 @@ def _motion(
         still = ~state.tracking | (misfit < SAME_POSTURE**2)
         believe = tracking & still & (earlier > 0).any(-1)
         turn = np.where(believe[..., None, None], turn, eye)
-        return turn, np.where(believe[..., None], move, shift)
+        return turn, np.where(believe[..., None], move, shift())
 
-    decide = tracking & (both > 0).any(-1)
-    if decide.all():
+    decide = tracking & (np.add.reduce(both, -1) > 0)
+    if every(decide):
         return kabsch(before, markers, both, lambda: believed()[0])
     turn, move = believed()
     seen_turn, seen_move = kabsch(before, markers, both, turn)
@@ -384,15 +397,12 @@ def _motion(
     )
 
 
-def posture_change(frame: Frame, visible: Array, weight: Array) -> Array:
+def posture_change(registered: Array, anchor: Array, parts: Array) -> Array:
     """`[...]` metres, RMS: how far the visible markers have gone in the registered frame since the
-    corrections were set; 0 where none is hidden."""
-    everything = visible.all(-1)
-    if everything.all():
-        return np.zeros(everything.shape, weight.dtype)
-    difference = (frame.registered - frame.anchor) * weight[..., None]
-    square = (difference * difference).sum((-1, -2)) / np.maximum(weight.sum(-1), 1)
-    return np.where(everything, 0, np.sqrt(square))
+    corrections were set, by their `parts`, see `sight.parts_of`; 0 where none is hidden."""
+    gone = registered - anchor
+    square = (gone * gone).reshape(*gone.shape[:-2], 1, -1) @ parts
+    return np.sqrt(square[..., 0, 0])
 
 
 def blend(
@@ -403,15 +413,21 @@ def blend(
     visible: Array,
     weight: Array,
     dt: Array,
-) -> tuple[Array, Array]:
-    """The corrections to keep, and those to add now; `[..., M, 3]`, registered frame."""
-    if np.count_nonzero(correction * weight[..., None]):
-        length = np.sqrt((correction * correction).sum(-1))
-        left = np.maximum(length - SHRINK_SPEED * dt[..., None], 0)
-        share = np.where(visible & (length > 0), left / np.where(length > 0, length, 1), 1)
-        correction = correction * share[..., None]
-    fade = np.where(tracking, np.exp(-change / model.fade), 0)
-    return correction, np.where(visible[..., None], correction, correction * fade[..., None, None])
+) -> tuple[Array, Array, Array]:
+    """The corrections to keep, and those to add now; `[..., M, 3]`, registered frame. And
+    `[..., M]` True where a visible marker has none."""
+    fade = np.exp(-change / model.fade)
+    if not every(tracking):
+        fade = np.where(tracking, fade, 0)
+    fading = correction * fade[..., None, None]
+    if not np.count_nonzero(correction * weight[..., None]):
+        return correction, fading, visible
+    length = np.sqrt(squares(correction))
+    left = np.maximum(length - SHRINK_SPEED * dt[..., None], 0)
+    share = np.where(visible, left / np.maximum(length, 1e-30), 1)
+    correction = correction * share[..., None]
+    added = np.where(visible[..., None], correction, fading)
+    return correction, added, visible & (left == 0)
 
 
 def choose(condition: Array, yes: Any, no: Any) -> Any:

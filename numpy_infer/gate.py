@@ -25,8 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numpy_infer.arrays import Array
-from numpy_infer.geometry import kabsch, mean_point, second_extent, transform
+from numpy_infer.arrays import Array, every
+from numpy_infer.geometry import kabsch, mean_point, second_extent, squares, transform
 from numpy_infer.hand import ANGLES, HIGH, JOINTS, LOW, PARENTS, Hand
 from numpy_infer.model import Model
 from numpy_infer.output import leading
@@ -212,8 +212,8 @@ def step(
     far = _off(moved, state.velocity, dt)
     # A coordinate that is the same again may be a frozen one.
     told = np.count_nonzero(moved) == 3 * np.count_nonzero(visible)
-    alike = state.calm.all() and (visible == state.visible).all()
-    if told and alike and far.max() < QUIET**2 and dt.min() > BRIEFEST:
+    alike = every(state.calm) and not np.count_nonzero(visible != state.visible)
+    if told and alike and every(far < QUIET**2) and every(dt > BRIEFEST):
         return _quietly(state, markers, moved, visible, dt), visible
     quiet = state.calm & _quiet(moved, state.velocity, visible, state.visible, dt)
     repeated = ~(dt > 0) & (visible == state.visible).all(-1) & (moved == 0).all((-1, -2))
@@ -313,9 +313,14 @@ def _quiet(moved: Array, velocity: Array, visible: Array, before: Array, dt: Arr
 
 def _off(moved: Array, velocity: Array, dt: Array) -> Array:
     """`[..., M]` m²: the square of how far markers left their uniform motion, beside the others."""
-    off = moved - velocity * dt[..., None, None]
-    off = off - off.sum(-2, keepdims=True) / moved.shape[-2]
-    return (off * off).sum(-1)
+    centring = _centring(moved.shape[-2]).astype(moved.dtype, copy=False)
+    return squares(centring @ (moved - velocity * dt[..., None, None]))
+
+
+@lru_cache(maxsize=16)
+def _centring(count: int) -> Array:
+    """`[M, M]` takes so many points to where they are from their mean."""
+    return np.eye(count) - 1 / count
 
 
 def _quietly(

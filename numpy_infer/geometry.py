@@ -10,12 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numpy_infer.arrays import Array
+from numpy_infer.arrays import Array, some
 
 PRIOR_STRENGTH = 1e-6
 """m²: below this second singular value of the cross-covariance (points within about 1 mm of a
 line) the prior decides what the points do not; above it, it has no say at all."""
 
+_FOUR_ROWS, _FOUR_COLUMNS = np.divmod(np.arange(16), 4)
 _NEXT, _AFTER = np.array([1, 2, 0]), np.array([2, 0, 1])
 
 
@@ -58,7 +59,8 @@ def mean_point(points: Array, weight: Array) -> Array:
 
 def _shares(weight: Array) -> Array:
     """`[..., 1, N]` weights as parts of their sum; 0 where all are 0."""
-    return (weight / np.maximum(weight.sum(-1, keepdims=True), 1e-30))[..., None, :]
+    total = np.add.reduce(weight, -1, keepdims=True)
+    return (weight / np.maximum(total, 1e-30))[..., None, :]
 
 
 def second_extent(points: Array, weight: Array) -> Array:
@@ -66,6 +68,14 @@ def second_extent(points: Array, weight: Array) -> Array:
     collinear points."""
     centred = (points - _shares(weight) @ points) * np.sqrt(weight)[..., None]
     return np.sqrt(np.maximum(np.linalg.eigvalsh(centred.swapaxes(-1, -2) @ centred)[..., 1], 0))
+
+
+def squares(vectors: Array) -> Array:
+    """`[...]` squares of the lengths of `[..., 3]`."""
+    return (vectors * vectors) @ _ONES.astype(vectors.dtype, copy=False)
+
+
+_ONES = np.ones(3)
 
 
 def cross(a: Array, b: Array) -> Array:
@@ -115,11 +125,52 @@ def fit(
     values, quaternions = _horn(covariance)
     second = (values[..., 3] + values[..., 1]) / 2
     # Twice is enough: `prior_weight` measures at least 1/√3 of it.
-    if (second < 2 * PRIOR_STRENGTH).any():
+    if some(second < 2 * PRIOR_STRENGTH):
         prior = prior() if callable(prior) else prior
         _, quaternions = _horn(covariance + prior_weight(covariance)[..., None, None] * prior)
     rotation = _rotation(quaternions)
     return rotation, (mean - source.mean @ rotation.swapaxes(-1, -2))[..., 0, :], second
+
+
+class Folded(NamedTuple):
+    """Several patterns that one set of points is registered to again and again."""
+
+    shares: Array
+    """`[..., 1, N]` of the first pattern: about their weighted mean points are centred."""
+    table: Array
+    """`[..., 3N, 19K]` from such points: of each of `K` patterns Horn's matrix, and how far its own
+    mean is from there."""
+    mean: Array
+    """`[..., K, 3, 1]` metres: of the patterns' points."""
+
+
+def folded(sources: Array, weights: Array) -> Folded:
+    """Patterns of `sources [K, N, 3]` and `weights [..., K, N]`."""
+    shares, mean, spread = pattern(sources, weights)
+    batch, (count, points) = weights.shape[:-2], sources.shape[:2]
+    # Of the entries of a cross-covariance, target by source, those of Horn's matrix.
+    horn = (spread @ _OF_SOURCE.astype(spread.dtype, copy=False)).reshape(*spread.shape, 16)
+    table = np.zeros((*batch, points, 3, count, 19), spread.dtype)
+    table[..., :16] = horn.swapaxes(-4, -3).swapaxes(-3, -2)
+    for axis in range(3):
+        table[..., axis, :, 16 + axis] = shares[..., 0, :].swapaxes(-1, -2)
+    table = table.reshape(*batch, 3 * points, 19 * count)
+    return Folded(shares[..., 0, :, :], table, mean.swapaxes(-1, -2))
+
+
+def refit(source: Folded, target: Array) -> tuple[Array, Array, Array]:
+    """`fit` of target `[..., N, 3]` to several patterns at once, where no prior is needed: from
+    rotations that come with too small a second singular value, below twice `PRIOR_STRENGTH`,
+    nothing follows. Everything has `K` before its last axes."""
+    mean = source.shares @ target
+    batch, count = target.shape[:-2], source.mean.shape[-3]
+    flat = (target - mean).reshape(*batch, 1, -1) @ source.table
+    entries = flat.reshape(*batch, count, 19)
+    symmetric = entries[..., :16].reshape(*batch, count, 4, 4)
+    values, quaternions = np.linalg.eigh(symmetric)
+    rotation = _rotation(quaternions)
+    translation = mean + entries[..., 16:] - (rotation @ source.mean)[..., 0]
+    return rotation, translation, (values[..., 3] + values[..., 1]) / 2
 
 
 def kabsch(
@@ -170,9 +221,9 @@ def _horn(matrix: Array) -> tuple[Array, Array]:
 
 def _rotation(quaternions: Array) -> Array:
     """`[..., 3, 3]` of the last column, a unit quaternion xyzw, of `[..., 4, 4]`."""
-    q = quaternions[..., 3:]
-    products = (q * q.swapaxes(-1, -2)).reshape(*q.shape[:-2], 16)
-    return (products @ _OF_PRODUCTS.astype(q.dtype, copy=False)).reshape(*q.shape[:-2], 3, 3)
+    q = quaternions[..., 3]
+    products = q.take(_FOUR_ROWS, -1) * q.take(_FOUR_COLUMNS, -1)
+    return (products @ _OF_PRODUCTS.astype(q.dtype, copy=False)).reshape(*q.shape[:-1], 3, 3)
 
 
 def _horn_entries() -> Array:
@@ -186,6 +237,8 @@ def _horn_entries() -> Array:
 
 
 _HORN = _horn_entries().reshape(9, 16)
+_OF_SOURCE = _HORN.reshape(3, 3, 16).swapaxes(0, 1).reshape(3, 48)
+"""`[3, 48]` the same from a source's entries: with those of the target, and Horn's matrix."""
 _OF_PRODUCTS = _HORN.T.copy()
 """`[16, 9]` from the products of a quaternion's entries to its rotation: tr(Rᵀ matrix) = qᵀ K q."""
 
@@ -214,28 +267,42 @@ def shortest_arc(source: Array, target: Array, share: Array | None = None) -> Ar
     Vectors `[..., 3]` without length turn nothing. Between opposite ones every half turn is least:
     the one about the coordinate axis farthest from them, made perpendicular, is taken.
 
-    Made of two reflections, across the source and across the direction half way to where it goes:
-    no angle has to be known for it.
+    No angle has to be known for it: the sum of the unit quaternions of no turn and of twice the arc
+    has the direction of the arc's own.
     """
-    square, other = _dot(source, source), _dot(target, target)
-    target = target * np.sqrt(square / np.maximum(other, 1e-30))
-    half_way = source + target
-    half_square = _dot(half_way, half_way)
-    # 2 + 2 cos of the angle between them, times the square of their length.
-    if share is not None or (half_square <= 1.5 * square).any():
-        whole = np.ones_like(square[..., 0]) if share is None else share
-        source, half_way, target = _reflected(source, target, whole)
-        square = half_square = np.ones_like(square)
-    turned = target[..., None] * (source / square)[..., None, :]
-    turned -= half_way[..., None] * (half_way / half_square)[..., None, :]
-    turned += turned
-    turned += _EYE.astype(source.dtype, copy=False)
-    return turned
+    lengths = np.sqrt(squares(source) * squares(target))
+    turns = _cross_and_dot(source, target)
+    turns[..., 3] += lengths
+    if share is not None or np.count_nonzero(turns[..., 3] <= 0.75 * lengths):
+        whole = np.ones_like(lengths) if share is None else share
+        source, half_way, has_arc = _half_way(source, target, whole)
+        turns = np.where(has_arc, _cross_and_dot(source, half_way), [0, 0, 0, 1])
+        turns = turns.astype(source.dtype, copy=False)
+    products = turns.take(_FOUR_ROWS, -1) * turns.take(_FOUR_COLUMNS, -1)
+    rotation = products @ _WITH_SQUARE.astype(source.dtype, copy=False)
+    return (rotation[..., :9] / rotation[..., 9:]).reshape(*turns.shape[:-1], 3, 3)
 
 
-def _reflected(source: Array, target: Array, share: Array) -> tuple[Array, Array, Array]:
-    """Unit vectors `[..., 3]`: the source, the middle of that share of the arc, and its end; all
-    the source if there is no arc."""
+def _cross_and_dot(a: Array, b: Array) -> Array:
+    """`[..., 4]` cross and scalar product of `[..., 3]`: of unit vectors the quaternion, xyzw, of
+    twice the turn from one to the other."""
+    products = a.take(_ROWS, -1) * b.take(_COLUMNS, -1)
+    return products @ _CROSS_AND_DOT.astype(a.dtype, copy=False)
+
+
+_ROWS, _COLUMNS = np.divmod(np.arange(9), 3)
+_CROSS_AND_DOT = np.concatenate(
+    [_CROSS_BASIS.reshape(3, 3, 3).swapaxes(1, 2).reshape(9, 3), _EYE.reshape(9, 1)], 1
+)
+"""`[9, 4]` from the products of two vectors' entries."""
+_WITH_SQUARE = np.concatenate([_OF_PRODUCTS, np.eye(4).reshape(16, 1)], 1)
+"""`[16, 10]` from the products of a quaternion's entries: its rotation times the square of its
+length, and that square."""
+
+
+def _half_way(source: Array, target: Array, share: Array) -> tuple[Array, Array, Array]:
+    """Unit vectors `[..., 3]`: the source, and the middle of that share of the arc; and `[..., 1]`
+    False where there is no arc."""
     has_arc = (_dot(source, source) > 0) & (_dot(target, target) > 0)
     source, target = _direction(source), _direction(target)
     cosine = _dot(source, target)
@@ -247,8 +314,7 @@ def _reflected(source: Array, target: Array, share: Array) -> tuple[Array, Array
     angle = share[..., None] * np.arctan2(sine, cosine) / 2
     # Once more: of nearly opposite ones `aside` is not quite perpendicular.
     half_way = _direction(np.cos(angle) * source + np.sin(angle) * _direction(aside))
-    there = 2 * _dot(half_way, source) * half_way - source
-    return source, *(np.where(has_arc, part, source) for part in (half_way, there))
+    return source, half_way, has_arc
 
 
 def _direction(vector: Array) -> Array:

@@ -42,6 +42,9 @@ ERROR_CHANGES = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016)
 """Metres: changes of posture, RMS of the visible markers, at which `Model.expected_error` stands;
 between them it is linear."""
 
+_APART = 2 * ERROR_CHANGES[-1]
+"""Metres from row to row where they stand one behind the other."""
+
 AFFINE_ERROR = (
     (0.0002, 0.0018, 0.0033, 0.0061, 0.0075, 0.0404),
     (0.0002, 0.0018, 0.0034, 0.0062, 0.0077, 0.0414),
@@ -93,9 +96,17 @@ class Model:
     """Plain data about how the model was made and measured."""
 
     @cached_property
-    def error_growth(self) -> Array:
-        """`[K, 5]` how fast `expected_error` grows between `ERROR_CHANGES`."""
-        return np.diff(self.expected_error) / np.diff(ERROR_CHANGES)
+    def error_line(self) -> tuple[Array, Array]:
+        """`[6K]` changes of posture and what is expected there, the rows of `expected_error` one
+        behind the other: a row's changes count from its own of `error_rows`."""
+        rows = _APART * np.arange(len(self.expected_error))[:, None]
+        return (rows + ERROR_CHANGES).reshape(-1), self.expected_error.reshape(-1)
+
+    @cached_property
+    def error_rows(self) -> Array:
+        """`[M + 1]` where on `error_line` the row stands for 0…M markers hidden."""
+        hidden = np.clip(np.arange(len(self.hand) + 1), 1, len(self.expected_error))
+        return _APART * (hidden - 1)
 
     @cached_property
     def error_factors(self) -> Array:

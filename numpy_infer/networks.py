@@ -118,10 +118,11 @@ def _steps(spec: Spec, arrays: Mapping[str, Array]) -> tuple[Step, ...]:
 
 
 def _run(steps: tuple[Step, ...], x: Array) -> Array:
+    zero = np.zeros((), x.dtype)  # a number would be made one each time
     for kernel, bias, relu in steps:
         x = x @ kernel + bias
         if relu:
-            x = np.maximum(x, 0)
+            x = np.maximum(x, zero)
     return x
 
 
@@ -139,7 +140,7 @@ def predict(network: Network, inputs: Array, known: Array | None = None) -> Arra
     mean = network.input_mean
     centred = inputs.astype(mean.dtype, copy=False) - mean
     if known is not None:
-        centred = np.where(known, centred, mean.dtype.type(0))
+        centred = np.where(known, centred, np.zeros((), mean.dtype))
     return _run(network.folded, centred).astype(inputs.dtype)
 
 

@@ -27,6 +27,7 @@ from numpy_infer.geometry import PRIOR_STRENGTH, fit, kabsch, pattern, transform
 from numpy_infer.model import Model
 from numpy_infer.pose import State
 from numpy_infer.predictors import PREDICTORS
+from numpy_infer.sight import parts_of
 
 
 def together(model: Model, state: State, markers: Array, visible: Array, dt: Array) -> State | None:
@@ -56,6 +57,7 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         state.anchor,
         state.prior,
         state.drift,
+        state.change,
         registered,
         markers,
         visible,
@@ -64,6 +66,7 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
     elapsed = np.cumsum(dt, 0)
     changed = (visible != np.concatenate([state.visible, visible[:-1]])).any(-1)
     at = np.flatnonzero(changed.any(tuple(range(1, changed.ndim))))
+    changes = None
     if len(at):
         changes = _changes(model, state, frames, markers, visible, at)
         if changes is None:
@@ -71,6 +74,9 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         frames = frames._replace(**_since(frames, changes, changed, at))
         for begin, end in pairwise([*at, len(dt)]):
             elapsed[begin:end] = np.cumsum(dt[begin:end], 0)
+    change = posture_change(registered, frames.anchor, parts_of(visible, markers.dtype))
+    frames = frames._replace(change=change)
+    if changes is not None:
         frames = frames._replace(
             **_chained(model, state, frames, changes, visible, elapsed, changed, at)
         )
@@ -161,8 +167,7 @@ def _chained(
 ) -> dict[str, Array]:
     """What each frame has by way of all changes before: where markers were seen last, corrections,
     and how far the posture had gone."""
-    weight = visible.astype(elapsed.dtype)
-    change = posture_change(frames, visible, weight)
+    weight, change = visible.astype(elapsed.dtype), frames.change
     was_visible = np.concatenate([state.visible, visible[:-1]])
     gone = np.concatenate([state.change, change[:-1]])[..., None]
     seen, correction, drift = state.seen[0], state.correction[0], state.drift[0]
@@ -174,7 +179,7 @@ def _chained(
             if begin:
                 seen = np.where(visible[last][..., None], frames.registered[last], seen)
             if begin and model.continuity:
-                correction, added = blend(
+                correction, added, _ = blend(
                     model,
                     correction,
                     frames.tracking[0],

@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 
 from numpy_infer import one_euro
-from numpy_infer.arrays import Array
-from numpy_infer.geometry import kabsch, mirror, mirror_rotation
+from numpy_infer.arrays import Array, every, some
+from numpy_infer.geometry import PRIOR_STRENGTH, kabsch, mirror, mirror_rotation, refit, squares
 from numpy_infer.joints import joint_stage
 from numpy_infer.model import ERROR_CHANGES, Model
 from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import HandPose, Notice, State, Status, TrackingState
 from numpy_infer.predictors import PREDICTORS
+from numpy_infer.sight import aligned
 
 # As numbers: an enumeration's members are slow to reckon with.
 _PREDICTED, _HELD, _REJECTED = map(int, (Status.PREDICTED, Status.HELD, Status.REJECTED))
@@ -29,9 +30,12 @@ HUGE = 1.0
 
 def wrist_pose(model: Model, output: Array, prior: Array) -> tuple[Array, Array]:
     """The wrist's rotation `[..., 3, 3]` and position `[..., 3]`, from all markers."""
-    template = model.body.template.astype(output.dtype, copy=False)
-    alignment = model.hand.alignment_weight.astype(output.dtype, copy=False)
-    return kabsch(template, output, alignment, prior)
+    rotation, position, second = refit(aligned(model.hand, model.body, output.dtype.char), output)
+    if second.min() < 2 * PRIOR_STRENGTH:
+        template = model.body.template.astype(output.dtype, copy=False)
+        alignment = model.hand.alignment_weight.astype(output.dtype, copy=False)
+        return kabsch(template, output, alignment, prior)
+    return rotation[..., 0, :, :], position[..., 0, :]
 
 
 def smoothed(model: Model, smoothing: Smoothing, state: State, dt: Array) -> tuple[State, State]:
@@ -49,16 +53,18 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
     visible, tracking = state.visible, state.tracking
     filled: Array | int = _PREDICTED if PREDICTORS[model.predictor].uses_frame else _HELD
     found = np.zeros(tracking.shape, int)
-    if np.count_nonzero(tracking) < tracking.size:
+    if not every(tracking):
         filled = np.where(tracking, filled, _HELD)[..., None]
         seen = visible.any(-1) & state.tracked
         found = np.where(tracking, _TRACKING, np.where(seen, _DEGRADED, _LOST))
-    status, notice = ~visible * filled, late * _NON_POSITIVE_DT
+    status, notice = ~visible * filled, np.zeros(late.shape, int)
+    if some(late):
+        notice = late * _NON_POSITIVE_DT
     if np.count_nonzero(state.rejected):
         status = np.where(state.rejected, _REJECTED, status)
         notice = notice | state.rejected.any(-1) * _REJECTED_MARKERS
     size = np.abs(state.seen)
-    if size.max() > HUGE:
+    if np.count_nonzero(size > HUGE):
         notice = notice | (size.max((-1, -2)) > HUGE) * _SUSPECTED_MILLIMETRES
     pose = HandPose(
         markers=state.output.copy(),
@@ -70,7 +76,7 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
         state=found,
         notice=notice,
     )
-    return _to_side(pose, state.right) if np.count_nonzero(state.right) else pose
+    return _to_side(pose, state.right) if some(state.right) else pose
 
 
 def _expected_error(model: Model, state: State) -> Array:
@@ -79,18 +85,13 @@ def _expected_error(model: Model, state: State) -> Array:
     hidden, dtype = ~state.visible, state.drift.dtype
     if not np.count_nonzero(hidden):
         return np.zeros_like(state.drift)
-    row = np.minimum(np.maximum(hidden.sum(-1), 1), len(model.expected_error)) - 1
-    gone = (state.drift + state.change[..., None])[..., None] - _CHANGES
-    steps = np.minimum(np.maximum(gone, 0), _CHANGE_STEPS)
-    grown = (steps @ model.error_growth[row][..., None])[..., 0]
-    off = (model.expected_error[row, 0][..., None] + grown) * model.error_factors
-    faded = model.faded_error * (1 - np.exp(-state.change / model.fade))
-    length = np.sqrt((state.correction * state.correction).sum(-1))
-    return ((off + faded[..., None] * length) * hidden).astype(dtype, copy=False)
-
-
-_CHANGES = np.array(ERROR_CHANGES[:-1])
-_CHANGE_STEPS = np.diff(ERROR_CHANGES)
+    row, (changes, errors) = model.error_rows.take(np.add.reduce(hidden, -1)), model.error_line
+    gone = np.minimum(state.drift + state.change[..., None], ERROR_CHANGES[-1])
+    error = np.interp(gone + row[..., None], changes, errors) * model.error_factors
+    if model.faded_error:
+        faded = model.faded_error * (1 - np.exp(-state.change / model.fade))
+        error += faded[..., None] * np.sqrt(squares(state.correction))
+    return (error * hidden).astype(dtype, copy=False)
 
 
 def _to_side(pose: HandPose, right: Array) -> HandPose:

@@ -250,7 +250,7 @@ def predicted_markers(model: Model, registered: Array, visible: Array) -> Array:
     """
     network: Network = model.marker_network  # type: ignore[assignment]
     features = registered.reshape(*registered.shape[:-2], -1)
-    known = np.repeat(visible, 3, -1)
+    known = visible.repeat(3, -1)
     return predict(network, features, known).reshape(registered.shape)
 
 

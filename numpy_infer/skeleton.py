@@ -2,40 +2,30 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import Any, NamedTuple
-
 import numpy as np
 
-from numpy_infer.arrays import Array
-from numpy_infer.geometry import shortest_arc, transform
-from numpy_infer.hand import ANGLES, CHAINS, FINGERS, JOINTS, POINTS, THUMB_AXES, Hand
-
-
-def _axis(letter: str, joint: str) -> list[float]:
-    axes = np.array(THUMB_AXES) if joint.startswith("thumb") else np.eye(3)
-    return list(axes[:, "xyz".index(letter)])
-
-
-def _cross_matrix(axis: list[float]) -> Array:
-    x, y, z = axis
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-SIGNS = np.array([angle.sign for angle in ANGLES])
-CROSS = np.stack([_cross_matrix(_axis(angle.axis, angle.joint)) for angle in ANGLES])
-"""`[26, 3, 3]` cross-product matrices of the angles' axes in the flat hand's frame."""
-
-CROSS_SQUARED = CROSS @ CROSS
+from numpy_infer.arrays import Array, every
+from numpy_infer.finger_forms import (
+    AXES_FORM,
+    BASE_ANGLES,
+    BASE_AXES,
+    CROSS,
+    CROSS_SQUARED,
+    FINGER_ANGLES,
+    FLEXIONS,
+    JOINT_AXES,
+    OUTER_ANGLES,
+    SIGNS,
+    FingerWaves,
+    finger_waves,
+    waves,
+)
+from numpy_infer.geometry import shortest_arc, squares, transform
+from numpy_infer.hand import ANGLES, JOINTS, POINTS, Hand
 
 _BY_JOINT = [[i for i, a in enumerate(ANGLES) if a.joint == joint] for joint in JOINTS[1:]]
 SLOTS = np.array([[[*of, 26, 26][slot] for of in _BY_JOINT] for slot in range(3)])
 """`[3, 15]` which angle turns each finger joint first, second, third; 26 means none."""
-
-JOINT_AXES = np.stack(
-    [np.array(THUMB_AXES) if joint.startswith("thumb") else np.eye(3) for joint in JOINTS[1:]]
-)
-"""`[15, 3, 3]` the joints' own axes in the flat hand, as columns."""
 
 EULER = (
     np.array([JOINTS.index(angle.joint) - 1 for angle in ANGLES]),
@@ -51,36 +41,12 @@ _SLOT_SIGNS = np.append(SIGNS, 0)[SLOTS]
 _SLOT_ANGLES = np.minimum(SLOTS, len(ANGLES) - 1)
 _EYE = np.eye(3)
 
-BASE_ANGLES = np.array([[i for i, a in enumerate(ANGLES) if a.joint == j] for j in JOINTS[1::3]])
-"""`[5, 3]` the angles of each finger's base: about its x, y and z."""
-
-_OUTER = (
-    ("thumb_mcp_flexion", "thumb_mcp_abduction", "thumb_ip_flexion"),
-    *((f"{finger}_pip_flexion", None, f"{finger}_dip_flexion") for finger in FINGERS[1:]),
-)
-_NAMES = [angle.name for angle in ANGLES]
-OUTER_ANGLES = np.array([[_NAMES.index(name or row[0]) for name in row] for row in _OUTER])
-"""`[5, 3]` the angles beyond each finger's base: of its middle joint flexion and abduction, which
-only a thumb has, and flexion of its last joint."""
-FLEXIONS = OUTER_ANGLES[:, [0, 2]]
-
-_TURNING = SIGNS[OUTER_ANGLES] * np.array([[name is not None for name in row] for row in _OUTER])
-_SIGNED_CROSS = np.stack(
-    [
-        (SIGNS[:, None, None] * CROSS)[BASE_ANGLES],
-        _TURNING[..., None, None] * CROSS[OUTER_ANGLES],
-    ],
-    1,
-)
-_SIGNED_SQUARED = _SIGNED_CROSS @ _SIGNED_CROSS
-WAVES = np.stack([np.eye(3) + _SIGNED_SQUARED, -_SIGNED_SQUARED, _SIGNED_CROSS], 3)
-"""`[5, 2, 3, 3, 3, 3]` of the angles at each finger's base, and beyond it: what 1, cosine and sine
-of the angle are worth in its rotation."""
-
 BEND_NOISE, BEND_PRIOR = 2e-3, 0.1
 """Metres and radians: how far a marker may be off, and how far a joint."""
 FARTHEST_BEND = 0.5
 """Radians: no more in a frame, whatever is said to be measured."""
+NEAREST = 1e-6
+"""Metres: no marker is taken to be nearer to its finger's base."""
 
 
 def rotations_from_angles(angles: Array) -> Array:
@@ -103,21 +69,38 @@ def angles_from_rotations(rotations: Array) -> Array:
     A rotation that a joint's angles cannot express loses the part they lack. The middle angle of
     the three, abduction, lies in ±π/2: there flexion and twist are one motion and not told apart.
     """
-    return _euler(rotations, JOINT_AXES)[..., *EULER] * SIGNS.astype(rotations.dtype)
+    dtype = rotations.dtype
+    axes = JOINT_AXES.astype(dtype, copy=False)
+    turns = axes.swapaxes(-1, -2) @ rotations @ axes
+    return _euler(turns)[..., *EULER] * _SIGNS.astype(dtype, copy=False)
 
 
-def _euler(rotations: Array, axes: Array) -> Array:
-    """`[..., 3]` radians about x, y and z of `axes`, in that order, of `[..., 3, 3]`. The latter
-    two of what the first leaves (Day 2012): near ±90° about y, where the first is hardly known,
-    they make up for it."""
-    axes = axes.astype(rotations.dtype, copy=False)
-    m = axes.swapaxes(-1, -2) @ rotations @ axes
-    euler = np.empty(m.shape[:-1], rotations.dtype)
-    euler[..., 0] = about_x = np.arctan2(-m[..., 1, 2], m[..., 2, 2])
+_OF_AXES = np.array([-1, 1, -1])
+_SIGNS = SIGNS * _OF_AXES[EULER[1]]
+"""`[26]` of what `_euler` gives."""
+_SURELY_TOLD = 0.99
+"""Sine of the middle angle: up to here the first and the last are told apart well."""
+_OPPOSITE, _ADJACENT = np.array([5, 1]), np.array([8, 0])
+"""Places in a flat rotation: less the sine, and the cosine, of its first and last angle, times the
+cosine of the middle one."""
+
+
+def _euler(rotations: Array) -> Array:
+    """`[..., 3]` radians about −x, y and −z, in that order, of `[..., 3, 3]`."""
+    euler = np.empty(rotations.shape[:-1], rotations.dtype)
+    flat = rotations.reshape(*rotations.shape[:-2], 9)
+    if every(np.abs(flat[..., 2]) < _SURELY_TOLD):
+        np.arctan2(flat.take(_OPPOSITE, -1), flat.take(_ADJACENT, -1), out=euler[..., ::2])
+        np.arcsin(flat[..., 2], out=euler[..., 1])
+        return euler
+    # The latter two of what the first leaves (Day 2012): near ±90° about y, where the first is
+    # hardly known, they make up for it.
+    m = rotations
+    euler[..., 0] = about_x = np.arctan2(m[..., 1, 2], m[..., 2, 2])
     cosine, sine = np.cos(about_x), np.sin(about_x)
-    left = cosine[..., None] * m[..., 1, :2] + sine[..., None] * m[..., 2, :2]
-    euler[..., 1] = np.arctan2(m[..., 0, 2], cosine * m[..., 2, 2] - sine * m[..., 1, 2])
-    euler[..., 2] = np.arctan2(left[..., 0], left[..., 1])
+    left = cosine[..., None] * m[..., 1, :2] - sine[..., None] * m[..., 2, :2]
+    euler[..., 1] = np.arctan2(m[..., 0, 2], cosine * m[..., 2, 2] + sine * m[..., 1, 2])
+    euler[..., 2] = -np.arctan2(left[..., 0], left[..., 1])
     return euler
 
 
@@ -204,41 +187,30 @@ def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
     Returns:
         `[..., 26]` radians.
     """
-    ends, has = hand.end_markers
-    forms, dtype = _forms(hand), angles.dtype
-    value = _waves(angles.take(OUTER_ANGLES, -1))
-    waves = (value @ _AND_SLOPE.astype(dtype, copy=False)).reshape(*value.shape[:-1], 2, 3)
-    # Value and slope by the middle joint, times the abduction's value; then by the last joint.
-    first = waves[..., 0, :, :, None] * value[..., 1, None, None, :]
-    form = first.reshape(*first.shape[:-2], 9) @ forms.square.astype(dtype, copy=False)
-    form = form @ waves[..., 2, :, :].swapaxes(-1, -2)
-    reach = np.sqrt(np.maximum(form[..., :1, 0], 0))
-    slopes = form.reshape(*form.shape[:-2], 4)[..., 2:0:-1] / (2 * np.where(reach > 0, reach, 1))
-    target = markers.take(ends, -2) - hand.skeleton[1:16:3].astype(dtype, copy=False)
-    short = np.sqrt((target[..., None, :] @ target[..., None])[..., 0]) - reach
-    if np.count_nonzero(has) < has.size:
-        short = short * has.astype(dtype)[:, None]
-    damped = (slopes[..., None, :] @ slopes[..., None])[..., 0] + (BEND_NOISE / BEND_PRIOR) ** 2
+    fingers, dtype = finger_waves(hand), angles.dtype
+    beyond = waves(angles.take(OUTER_ANGLES, -1))
+    form = (beyond[..., None, :] @ fingers.square.astype(dtype, copy=False))[..., 0, :]
+    # Of squares, their slopes too, so that no distance is divided by. No marker: no slope.
+    square, slopes = np.maximum(form[..., :1], NEAREST**2), form[..., 1:]
+    target = _towards(fingers, markers)
+    short = np.sqrt(square * squares(target)[..., None]) - square
+    damped = (slopes * slopes) @ _HALF_SUM.astype(dtype, copy=False) + _DAMPING * square
     bend = np.minimum(np.maximum(slopes * (short / damped), -FARTHEST_BEND), FARTHEST_BEND)
     return angles + bend.reshape(*angles.shape[:-1], 10) @ _BENT.astype(dtype, copy=False)
 
 
-_AND_SLOPE = np.array([[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 1], [0, 0, 1, 0, -1, 0]])
-"""`[3, 6]` 1, cosine and sine, and their slopes, of such three."""
+_HALF_SUM = np.full((2, 1), 0.5)
+_DAMPING = 2 * (BEND_NOISE / BEND_PRIOR) ** 2
 _BENT = np.eye(len(ANGLES))[FLEXIONS.reshape(10)]
 """`[10, 26]` all angles from the flexions."""
 
 
-def _waves(angles: Array) -> Array:
-    """`[..., 3]` 1, cosine and sine of `[...]`."""
-    waves = np.ones((*angles.shape, 3), angles.dtype)
-    np.cos(angles, waves[..., 1])
-    np.sin(angles, waves[..., 2])
-    return waves
-
-
 def place_fingers(
-    hand: Hand, angles: Array, markers: Array | None = None
+    hand: Hand,
+    angles: Array,
+    markers: Array | None = None,
+    wrist_rotation: Array | None = None,
+    wrist_position: Array | None = None,
 ) -> tuple[Array, Array, Array]:
     """All points of a hand with its fingers at `angles`, and turned about their bases until their
     outermost markers point to where they were measured (paper, section 2.2: finger alignment).
@@ -248,115 +220,74 @@ def place_fingers(
     sits. What that leaves, the distance from the base, is the matter of `bend_fingers`.
 
     What `rotations_from_angles` and `forward_kinematics` say of it, in few calls: whatever stands
-    beyond a finger's base is linear in the products of 1, cosine and sine of three angles.
+    beyond a finger's base is linear in the sines of sums of three angles, see `finger_forms`.
 
     Args:
         hand: its markers and bones.
         angles: `[..., 26]` radians.
         markers: `[..., M, 3]` metres, hand frame; None turns nothing.
+        wrist_rotation: `[..., 3, 3]` world_from_wrist; without it all is in the hand frame.
+        wrist_position: `[..., 3]` metres, world.
 
     Returns:
-        angles `[..., 26]` as they now are; positions `[..., 21, 3]` metres and rotations
-        `[..., 16, 3, 3]`, hand frame.
+        angles `[..., 26]` as they now are; positions `[..., 21, 3]` metres, world; rotations
+        `[..., 16, 3, 3]` world_from_joint.
     """
     batch, dtype = angles.shape[:-1], angles.dtype
-    forms, (ends, has) = _forms(hand), hand.end_markers
-    waves = _waves(angles.take(FINGER_ANGLES, -1))
-    products = waves[..., 0, :, None] * waves[..., 1, None, :]
-    products = (products[..., None] * waves[..., 2, None, None, :]).reshape(*batch, 5, 2, 1, 27)
-    turn = (products[..., 0, :, :] @ BASE_FORM.astype(dtype, copy=False)).reshape(*batch, 5, 3, 3)
-    own = products[..., 1, :, :] @ forms.beyond.astype(dtype, copy=False)
-    own = own.reshape(*batch, 5, 3, 10)
-    base = hand.skeleton[1:16:3].astype(dtype, copy=False)
+    fingers = finger_waves(hand)
+    # Sums of angles that are no hand's would be rounded apart, and no rotation come of them.
+    small = np.fmod(angles, _WHOLE_TURN.astype(dtype, copy=False))
+    both = waves(small.take(FINGER_ANGLES, -1))
+    turn = both[..., :1, :] @ AXES_FORM.astype(dtype, copy=False)
+    own = both[..., 1:, :] @ fingers.beyond.astype(dtype, copy=False)
+    turn, own = turn.reshape(*batch, 5, 3, 3), own.reshape(*batch, 5, 3, 14)
     if markers is not None:
-        modelled = (turn @ own[..., 9:])[..., 0]
-        measured = markers.take(ends, -2) - base
-        if np.count_nonzero(has) < has.size:
-            measured = np.where(has[:, None] > 0, measured, modelled)
+        modelled = (turn @ own[..., 13:])[..., 0]
+        measured = _towards(fingers, markers)
+        if fingers.bare is not None:
+            measured = np.where(fingers.bare, modelled, measured)
         turn = shortest_arc(modelled, measured) @ turn
-        angles = angles.copy()
-        angles[..., BASE_ANGLES] = _euler(turn, JOINT_AXES[::3]) * _BASE_SIGNS.astype(dtype)
-    placed = turn @ own[..., :9]
-    positions = np.zeros((*batch, len(POINTS), 3), dtype)
-    positions[..., 1:16:3, :] = base
-    beyond = placed[..., :3].swapaxes(-1, -2) + base[:, None]
-    positions[..., 2:16:3, :], positions[..., 3:16:3, :] = beyond[..., 0, :], beyond[..., 1, :]
-    positions[..., 16:, :] = beyond[..., 2, :]
-    rotations = np.empty((*batch, len(JOINTS), 3, 3), dtype)
-    rotations[..., 0, :, :] = _EYE
-    rotations[..., 1::3, :, :] = turn
-    rotations[..., 2::3, :, :] = placed[..., 3:6]
-    rotations[..., 3::3, :, :] = placed[..., 6:]
-    return angles, positions, rotations
+        base_angles = _euler(turn) * _BASE_SIGNS.astype(dtype, copy=False)
+        angles = np.concatenate([angles, base_angles.reshape(*batch, 15)], -1)
+        angles = angles.take(_WITH_BASE_ANGLES, -1)
+    if wrist_rotation is None or wrist_position is None:
+        wrist_rotation = np.broadcast_to(_EYE.astype(dtype, copy=False), (*batch, 3, 3))
+        wrist_position = np.zeros((*batch, 3), dtype)
+    axes = wrist_rotation[..., None, :, :] @ BASE_AXES.astype(dtype, copy=False)
+    placed = turn @ own[..., :13] + fingers.bases.astype(dtype, copy=False)
+    placed = (axes @ placed).reshape(*batch, 195)
+    wrist = wrist_rotation.reshape(*batch, 9)
+    everything = np.concatenate([np.zeros((*batch, 3), dtype), wrist, placed], -1)
+    positions = everything.take(_POINTS, -1) + wrist_position[..., None, :]
+    return angles, positions, everything.take(_ROTATIONS, -1)
 
 
-FINGER_ANGLES = np.stack([BASE_ANGLES, OUTER_ANGLES], 1)
-"""`[5, 2, 3]` of each finger those of its base, and those beyond."""
-_BASE_SIGNS = SIGNS[BASE_ANGLES]
-BEYOND = np.array(CHAINS)[:, 1:]
-"""`[5, 3]` the points of each finger after its base."""
-_TURN = "fiab,fjbc,fkcd->fijkad"
-BASE_FORM = np.einsum(_TURN, *np.moveaxis(WAVES[:, 0], 1, 0)).reshape(5, 27, 9)
-"""The rotation of a finger's base, linear in such products of its angles."""
+def _towards(fingers: FingerWaves, markers: Array) -> Array:
+    """`[..., 5, 3]` metres, each in its finger's own axes: from the base to where the outermost
+    marker was measured, of `markers [..., M, 3]`, hand frame."""
+    flat = markers.reshape(*markers.shape[:-2], -1)
+    ends = flat @ fingers.ends.astype(markers.dtype, copy=False)
+    ends -= fingers.base_by_axes.astype(markers.dtype, copy=False)
+    return ends.reshape(*flat.shape[:-1], 5, 3)
 
 
-class FingerForms(NamedTuple):
-    """What stands beyond the fingers' bases, linear in products of 1, cosine and sine of the angles
-    `OUTER_ANGLES`, the last one's running fastest."""
-
-    beyond: Array
-    """`[5, 27, 30]` in the base joint's frame, as `[3, 10]`: the points after the base, metres; the
-    rotations of the two joints; the outermost marker, metres."""
-    square: Array
-    """`[5, 9, 3]` m²: the square of that marker's distance from the base."""
-
-
-_FIRST, _SIDE, _LAST = np.moveaxis(WAVES[:, 1], 1, 0)
-_MIDDLE = np.einsum("fiab,fjbc->fijac", _FIRST, _SIDE)
-_OUTER = np.einsum(_TURN, _FIRST, _SIDE, _LAST)
-
-
-def finger_forms(hand: Hand, xp: Any = np) -> FingerForms:
-    """The forms of a hand's bones and markers; `xp` is numpy, or `jax.numpy` for traced ones."""
-    arms = end_arms(hand, xp)
-    # Of 1, cosine and sine: 1 alone.
-    one, middle, outer, last = (
-        xp.asarray(part, arms.dtype) for part in (np.eye(3)[0], _MIDDLE, _OUTER, _LAST)
-    )
-
-    def point(parts: Array) -> Array:
-        """`[5, 3, 3, 3, 3]` of three parts `[5, 3, 3]`, each carried by a further joint."""
-        near = xp.einsum("i,j,k,fa->fijka", one, one, one, parts[:, 0])
-        between = xp.einsum("fijac,fc,k->fijka", middle, parts[:, 1], one)
-        return near + between + xp.einsum("fijkad,fd->fijka", outer, parts[:, 2])
-
-    bones = xp.asarray(hand.skeleton)[BEYOND]
-    points = [point(xp.where(np.arange(3)[:, None] <= n, bones, 0)) for n in range(3)]
-    turns = xp.einsum("fijac,k->fijkac", middle, one), outer
-    columns = [xp.stack(points, -1), *turns, point(arms)[..., None]]
-    out = xp.einsum("fkcd,fd->fkc", last, arms[:, 2])
-    inner = xp.einsum("fijac,fc,k->fijka", middle, arms[:, 1], one)
-    inner = inner + xp.einsum("fijac,fkc->fijka", middle, out)
-    square = 2 * xp.einsum("fa,fijka->fijk", arms[:, 0], inner)
-    square = square + 2 * xp.einsum("i,j,fc,fkc->fijk", one, one, arms[:, 1], out)
-    length = (arms * arms).sum((-1, -2))
-    square = square + xp.einsum("i,j,k,f->fijk", one, one, one, length)
-    beyond = xp.concatenate(columns, -1).reshape(5, 27, 30)
-    return FingerForms(beyond, square.reshape(5, 9, 3))
-
-
-_forms = lru_cache(maxsize=16)(finger_forms)
-
-
-def end_arms(hand: Hand, xp: Any = np) -> Array:
-    """`[5, 3, 3]` metres: the way from each finger's base to its outermost marker, in the three
-    parts that its joints carry, from the base out; 0 where it has none. `xp` as above."""
-    ends, has = hand.end_markers
-    joints, links = (places[ends, None] for places in hand.placing)
-    level = np.arange(3)
-    between = (np.array(CHAINS) == joints).argmax(-1)[:, None] > level
-    skeleton, offsets = xp.asarray(hand.skeleton), xp.asarray(hand.offsets)
-    carries = has[:, None] > 0
-    bones = xp.where((carries & between)[..., None], skeleton[BEYOND], 0)
-    own = (carries & ((links - 1) % 3 == level))[..., None]
-    return bones + xp.where(own, offsets[ends, None].astype(skeleton.dtype), 0)
+_WHOLE_TURN = np.array(2 * np.pi)
+_BASE_SIGNS = SIGNS[BASE_ANGLES] * _OF_AXES
+_WITH_BASE_ANGLES = np.arange(len(ANGLES))
+_WITH_BASE_ANGLES[BASE_ANGLES] = len(ANGLES) + np.arange(15).reshape(5, 3)
+"""`[26]` places in all angles, with those of the bases as they are to be behind them."""
+_PLACED = 12 + np.arange(5 * 3 * 13).reshape(5, 3, 13)
+"""Places, behind the wrist's own and its rotation, of what `place_fingers` makes of
+`FingerWaves.beyond`."""
+_ROTATIONS = 3 + np.arange(9).reshape(1, 3, 3)
+_ROTATIONS = np.concatenate(
+    [_ROTATIONS, _PLACED[..., :9].reshape(5, 3, 3, 3).swapaxes(1, 2).reshape(15, 3, 3)]
+)
+"""`[16, 3, 3]`, and of points `[21, 3]`, in the world but for the wrist's position."""
+_POINTS = np.concatenate(
+    [
+        np.arange(3)[None],
+        _PLACED[..., 9:12].swapaxes(1, 2).reshape(15, 3),
+        _PLACED[..., 12],
+    ]
+)

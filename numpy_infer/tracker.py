@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from numpy_infer import gate, one_euro, wearer
-from numpy_infer.arrays import Array
+from numpy_infer.arrays import Array, some
 from numpy_infer.continuity import advance, each
 from numpy_infer.geometry import mirror, second_extent
 from numpy_infer.hand import Hand
@@ -173,6 +173,8 @@ def _smoothed(
     return own, every._replace(output=output, wrist_rotation=rotation, wrist_position=position)
 
 
+_ORIGIN = np.zeros(3)  # a number would be made one each time
+
 SHOWN = (
     *("rejected", "output", "wrist_rotation", "wrist_position", "visible", "tracked", "tracking"),
     *("seen", "correction", "drift", "change"),
@@ -188,14 +190,16 @@ def _cleaned(
     dtype = state.markers.dtype
     within = np.abs(markers) < FARTHEST
     visible = visible & within[..., 0] & within[..., 1] & within[..., 2]
-    markers = np.where(visible[..., None], markers, 0).astype(dtype, copy=False)
-    if np.count_nonzero(state.right):
+    markers = np.where(visible[..., None], markers, _ORIGIN).astype(dtype, copy=False)
+    if some(state.right):
         markers = np.where(state.right[..., None, None], mirror(markers), markers)
     late = np.logical_not(dt > 0)  # a Python float's `~` would be a number
     elapsed = np.minimum(dt, LONGEST)
-    if np.count_nonzero(late):
+    if some(late):
         elapsed = np.where(late, 0, elapsed)
-    return markers, visible, elapsed.astype(dtype, copy=False), late
+    if elapsed.dtype != dtype:
+        elapsed = elapsed.astype(dtype)
+    return markers, visible, elapsed, late
 
 
 class HandTracker:
@@ -213,6 +217,7 @@ class HandTracker:
         self.model = model
         self._right = np.asarray(right, bool)
         self._state = init(model, self._right.shape, self._right)
+        self._all = np.ones((*self._right.shape, len(model.hand)), bool)
 
     @classmethod
     def load(
@@ -262,12 +267,12 @@ class HandTracker:
                 `status` and `notice`.
         """
         markers = np.asarray(markers, np.float64)
-        expected = (*self._right.shape, len(self.hand), 3)
-        if markers.shape != expected:
-            raise ValueError(f"markers: expected shape {expected}, received {markers.shape}")
-        shown = np.ones(expected[:-1], bool) if visible is None else np.asarray(visible, bool)
-        if shown.shape != expected[:-1]:
-            raise ValueError(f"visible: expected shape {expected[:-1]}, received {shown.shape}")
+        expected = self._all.shape
+        if markers.shape != (*expected, 3):
+            raise ValueError(f"markers: expected shape {(*expected, 3)}, received {markers.shape}")
+        shown = self._all if visible is None else np.asarray(visible, bool)
+        if shown.shape != expected:
+            raise ValueError(f"visible: expected shape {expected}, received {shown.shape}")
         elapsed = np.asarray(dt, np.float64)
         if elapsed.shape != self._right.shape:
             if elapsed.shape:

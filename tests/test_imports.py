@@ -28,10 +28,9 @@ TWINS = (
 ONE_SIDED = {
     # What XLA must be told about small matrix products; numpy has `@`.
     # And halves of `kabsch`, for the pipeline of one frame; XLA takes apart what it compiles.
-    "geometry": {"inner", "product", "pattern", "fit"},
-    # An IMU glove's rotations are no angles; the runtime has its fingers from angles. The forms of
-    # a hand are one function for both sides.
-    "skeleton": {"align_fingers", "finger_forms", "end_arms"},
+    "geometry": {"inner", "product", "pattern", "fit", "folded", "refit", "squares"},
+    # An IMU glove's rotations are no angles; the runtime has its fingers from angles.
+    "skeleton": {"align_fingers"},
     # For many frames at once, in `offline`: JAX scans over them.
     "continuity": {"blend", "blended", "each", "posture_change"},
     "gate": {"ahead", "reach"},  # and a table that both sides share

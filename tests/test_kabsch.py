@@ -27,7 +27,7 @@ from strategies import (
     weights,
 )
 
-from numpy_infer.geometry import PRIOR_STRENGTH
+from numpy_infer.geometry import PRIOR_STRENGTH, fit, folded, pattern, refit
 
 EYE = np.eye(3)
 MIRROR = np.diag([-1.0, 1.0, 1.0])
@@ -346,3 +346,23 @@ def test_jax_kabsch_is_safe_under_vmap() -> None:
     found = jax.jit(jax.vmap(ours.kabsch))(*question)
     for a, b in zip(found, theirs.kabsch(*question), strict=True):
         assert_allclose(a, b, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@given(points=spread_points(), mask=masks(), rotation=rotations(), away=noise((2, 3, 9, 3)))
+def test_several_patterns_at_once_are_fitted_as_one_by_one(
+    dtype: type, points: Array, mask: Array, rotation: Array, away: Array
+) -> None:
+    assume(mask.sum() > 2 and extents(points[mask])[1] > SPREAD)
+    sources = (points + 1e-3 * away[:, 0]).astype(dtype)
+    weights = np.ones((3, 2, 9), dtype)
+    weights[1, 1] = mask
+    targets = ((points + 1e-3 * away[0]) @ rotation.T + away[1, 0, 0]).astype(dtype)
+    for batch in (np.s_[:], 1):
+        found = refit(folded(sources, weights[batch]), targets[batch])
+        for k, source in enumerate(sources):
+            one = fit(pattern(source, weights[batch][..., k, :]), targets[batch], EYE)
+            for several, alone, axes in zip(found, one, (2, 1, 0), strict=True):
+                own = several.take(k, -1 - axes)
+                assert own.dtype == dtype
+                assert_allclose(own, alone, rtol=0, atol=1e-10 if dtype == np.float64 else 1e-4)
