@@ -16,9 +16,11 @@ import jax
 import numpy as np
 
 from jaxhand import datasets, simulation
+from jaxhand.evaluation import interval
 from jaxhand.expected_error import Samples, measure
 from jaxhand.export import with_expected_error
 from jaxhand.sequences import Sequence as MarkerSequence
+from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
 from numpy_infer.model import load
 
@@ -49,28 +51,37 @@ def takes(spec: str, split: datasets.Split, hand: Hand) -> Sequence[MarkerSequen
 
 
 def show(samples: Samples) -> None:
-    """Prints the bins."""
-    expected, measured = 1e3 * samples.expected, 1e3 * samples.measured
-    place = np.digitize(expected, EDGES) - 1
-    print("expected, mm      mean  measured  ratio  samples")
-    missed = counted = 0
+    """Prints the bins, each with the 95 % interval of its ratio."""
+    place = np.digitize(1e3 * samples.expected, EDGES) - 1
+    print("expected, mm      mean  measured  ratio                  samples")
+    missed = surely = counted = 0
     for i in np.unique(place):
         inside = place == i
-        means = expected[inside].mean(), measured[inside].mean()
-        off = means[0] / means[1]
+        off, low, high = line(f"{EDGES[i]:g} to {EDGES[i + 1]:g}", samples, inside)
         if inside.sum() >= FEWEST:
             counted += 1
             missed += abs(off - 1) > WITHIN
-        span = f"{EDGES[i]:g} to {EDGES[i + 1]:g}"
-        print(f"{span:14}{means[0]:8.2f}{means[1]:10.2f}{off:7.2f}{inside.sum():9}")
+            surely += low > 1 + WITHIN or high < 1 - WITHIN
+    line("all", samples, np.ones_like(place, bool))
+    correlation = np.corrcoef(samples.expected, samples.measured)[0, 1]
     print(
-        f"{'all':14}{expected.mean():8.2f}{measured.mean():10.2f}"
-        f"{expected.mean() / measured.mean():7.2f}{len(expected):9}"
+        f"correlation {correlation:.2f}; of {counted} bins with {FEWEST} samples or more, {missed} "
+        f"are more than {WITHIN:.0%} off, {surely} of them beyond chance"
     )
-    print(
-        f"correlation {np.corrcoef(expected, measured)[0, 1]:.2f}; "
-        f"{missed} of {counted} bins are more than {WITHIN:.0%} off"
-    )
+
+
+def line(name: str, samples: Samples, inside: Array) -> tuple[float, float, float]:
+    """Prints a line for some of the samples. Gives the ratio of what was expected to what was
+    measured, and its interval by a bootstrap of blocks of time."""
+    sums = [
+        np.bincount(samples.block[inside], 1e3 * values[inside])
+        for values in (samples.expected, samples.measured)
+    ]
+    cell, count = interval(*sums), inside.sum()
+    off, low, high = (np.nan if cell[k] is None else cell[k] for k in ("mean", "low", "high"))
+    mean, truly = (part.sum() / count for part in sums)
+    print(f"{name:14}{mean:8.2f}{truly:10.2f}{off:7.2f} ({low:5.2f} to {high:5.2f}){count:9}")
+    return off, low, high
 
 
 if __name__ == "__main__":

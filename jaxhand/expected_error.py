@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxhand import sequences as data
 from jaxhand import simulation
+from jaxhand.evaluation import BLOCK_SECONDS
 from numpy_infer import tracker
 from numpy_infer.arrays import Array
 from numpy_infer.model import ERROR_CHANGES, Model
@@ -50,18 +51,21 @@ class Samples(NamedTuple):
     """Metres: what the tracker said."""
     measured: Array
     """Metres: what it was off."""
+    block: Array
+    """Of the bootstrap: errors near in time are much the same, see `evaluation.BLOCK_SECONDS`."""
 
 
 def measure(model: Model, sequences: Sequence[data.Sequence], seed: int = 0) -> Samples:
     """Runs the numpy tracker through gaps (`simulation.gaps`) in the sequences."""
-    truth = _streams(sequences)
+    truth, pieces = _streams(sequences)
     frames, hands, markers = truth.shape[:3]
     key = jax.random.key(seed)
     seen = np.asarray(simulation.gaps(key, frames, markers, data.RATE, (hands,))).swapaxes(0, 1)
     known = np.isfinite(truth).all(-1)
     state = tracker.init(model, (hands,))
     time, found = np.full(hands, 1 / data.RATE), []
-    for points, there, visible in zip(truth, known, seen & known, strict=True):
+    blocks = (np.arange(frames) / (data.RATE * BLOCK_SECONDS)).astype(int)
+    for frame, (points, there, visible) in enumerate(zip(truth, known, seen & known, strict=True)):
         state, pose = tracker.step(
             model, state, np.where(visible[..., None], points, np.nan), visible, time
         )
@@ -77,13 +81,15 @@ def measure(model: Model, sequences: Sequence[data.Sequence], seed: int = 0) -> 
                 (1 - np.exp(-change / model.fade)) * length,
                 pose.expected_error[hidden],
                 np.linalg.norm(pose.markers - points, axis=-1)[hidden],
+                blocks[frame] * pieces + hand % pieces,
             )
         )
     return Samples(*(np.concatenate(field) for field in zip(*found, strict=True)))
 
 
-def _streams(sequences: Sequence[data.Sequence]) -> Array:
-    """`[T, N, M, 3]` pieces of the sequences side by side, NaN after their ends."""
+def _streams(sequences: Sequence[data.Sequence]) -> tuple[Array, int]:
+    """`[T, N, M, 3]` pieces of the sequences side by side, NaN after their ends; and how many, from
+    where on they come again."""
     pieces = [
         np.asarray(sequence.markers[first : first + PIECE], np.float64)
         for sequence in sequences
@@ -93,7 +99,7 @@ def _streams(sequences: Sequence[data.Sequence]) -> Array:
     padded = np.full((longest, len(pieces), *pieces[0].shape[1:]), np.nan)
     for i, piece in enumerate(pieces):
         padded[: len(piece), i] = piece
-    return np.tile(padded, (1, -(-STREAMS // len(pieces)), 1, 1))
+    return np.tile(padded, (1, -(-STREAMS // len(pieces)), 1, 1)), len(pieces)
 
 
 class Expected(NamedTuple):

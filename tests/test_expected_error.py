@@ -66,7 +66,7 @@ def some_samples(seed: int) -> tuple[object, Array]:
     table = np.interp(change, ERROR_CHANGES, TABLE[0])
     means = rows[np.minimum(number, 6) - 1] * factors[marker] * table + 0.7 * faded
     measured = means * rng.gamma(2, 0.5, count)
-    return Samples(number, marker, change, faded, means, measured), means
+    return Samples(number, marker, change, faded, means, measured, number), means
 
 
 def test_what_is_fitted_is_what_the_errors_were_drawn_from() -> None:
