@@ -37,7 +37,7 @@ def sight(hand: Hand, body: Hand, visible: Array, dtype: np.dtype) -> Sight:
     return _sight(hand, body, dtype.char, visible.shape, visible.tobytes())
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=16)  # of hundreds of hands one takes megabytes
 def _sight(hand: Hand, body: Hand, dtype: str, shape: tuple[int, ...], seen: bytes) -> Sight:
     visible = np.frombuffer(seen, bool).reshape(shape)
     weight = visible.astype(dtype)
