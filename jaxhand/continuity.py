@@ -46,9 +46,9 @@ def advance(
     # But for the wrist's pose, which nothing here needs.
     own, accepted = state.gate, visible
     if model.gate:
-        own, accepted = gate.step(
-            model, state.gate, markers, visible, state.output, state.tracked, dt
-        )
+        # What holds markers, or lets them fly on, says nothing of where one comes back.
+        told = state.tracked & PREDICTORS[model.predictor].uses_frame
+        own, accepted = gate.step(model, state.gate, markers, visible, state.output, told, dt)
         markers = jnp.where(accepted[..., None], markers, 0)
     frame = _frame(model, state, markers, accepted, dt)
     new_state = _blended(model, state, frame, markers, accepted, dt)

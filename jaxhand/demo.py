@@ -201,7 +201,7 @@ def _train(hand: Hand, people: People, size: Size, seed: int, console: Console) 
 def _track(path: Path, streams: simulation.Streams, console: Console) -> HandPose:
     """Runs the exported file, and the affine baseline, over all streams with their gaps, and says
     how well they did. Gives the outputs for the first stream."""
-    learned = HandTracker.load(path)
+    learned = HandTracker.load(path, alignment=True)
     affine = HandTracker(replace(learned.model, predictor="affine", joints="none"))
     outputs: dict[str, list[HandPose]] = {"learned": [], "affine": []}
     seconds: list[float] = []

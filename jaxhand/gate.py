@@ -95,7 +95,8 @@ def step(
         markers: `[..., M, 3]` metres, world, of a left hand; 0 where hidden.
         visible: `[..., M]` True where measured.
         last: `[..., M, 3]` metres, world: the tracker's previous output.
-        tracked: `[...]` True once the hand has been tracked, so that `last` means something.
+        tracked: `[...]` True once the hand has been tracked by a predictor that goes by the frame,
+            so that `last` means something.
         dt: `[...]` seconds since the previous frame, not negative. At 0 nothing that runs on time
             moves, and the same markers again change nothing.
 

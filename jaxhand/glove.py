@@ -12,7 +12,7 @@ import tyro
 from rich.console import Console
 
 from jaxhand.calibration import DENSE, Calibration, calibrate, new_hand
-from jaxhand.hand_size import SIZES, Size, hand_size
+from jaxhand.hand_size import ALIKE, SIZES, Size, hand_size
 from jaxhand.joint_evaluation import evaluate_poses
 from numpy_infer import wearer
 from numpy_infer.arrays import Array
@@ -99,7 +99,8 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
             hand, seen, said = model.hand.resized(size.factor), size.seen, _of_size(size)
             if other.off < OTHER_SIDE * size.off:
                 side, off = "left" if _is_right(config) else "right", 1e3 * other.off
-                said.append(f"as a {side} hand they fit better, within {off:.1f} mm: see --right")
+                change = "leave out --right" if config.right else "see --right, --right-prefix"
+                said.append(f"as a {side} hand they fit better, within {off:.1f} mm: {change}")
     unseen = tuple(finger for finger, known in zip(FINGERS, seen, strict=True) if not known)
     flat = None if held is None else _flat(worn_by(model, hand), markers[held])
     person = Wearer(hand, flat, unseen)
@@ -212,7 +213,7 @@ def _of_size(size: Size) -> list[str]:
     low, high = (100 * (end - 1) for end in size.interval)
     text = f"{100 * (size.likeliest - 1):+.1f} % of the model's (95 %: {low:+.1f} to {high:+.1f})"
     if size.factor == 1:
-        text += ": too little to tell from the model's own, which is kept"
+        text += f": not surely {100 * ALIKE:g} % from the model's own, which is kept"
     return [
         f"the hand is {text}",
         f"markers fit within {1e3 * size.off:.1f} mm, root mean square (usual: 5 to 15 mm)",

@@ -41,6 +41,7 @@ from jaxhand.training_data import check_frames, check_joint_frames, collect
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
 from numpy_infer.model import Model
+from numpy_infer.model import load as load_model
 from numpy_infer.networks import Dense, Dropout, Spec, write_spec
 
 ADAM = optax.scale_by_adam()
@@ -114,7 +115,8 @@ class TrainingConfig:
     """The most epochs for each network."""
     start: Path | None = None
     """A model to go on from, with its hand and its layers: recordings of your own then refine it,
-    as far as is good on validation. Networks that the data say nothing of stay as they are."""
+    the marker network as far as is good on validation. Networks that the data say nothing of stay
+    as they are."""
     seed: int = 0
     """The same seed gives the same numbers on the same machine."""
     resume: bool = False
@@ -460,12 +462,16 @@ def train(config: TrainingConfig) -> Model:
         kept = "the best weights so far are kept" + ("" if begun else ", the joints have none yet")
         console.print(f"interrupted: {kept}; --resume goes on")
     model = replace(model, training={**model.training, "config": _plain(config)})
+    path, told = config.out / "model.npz", console.print
     try:
-        model = finish(model, given.sequences, console.print, given.start)
+        model = finish(model, given.sequences, told, given.start)
     except KeyboardInterrupt:
-        console.print("interrupted: fade and expected error keep their defaults")
-    model = export(model, config.out / "model.npz", overwrite=True)
-    console.print(f"wrote {config.out / 'model.npz'}")
+        if path.exists():
+            told(f"interrupted: {path} stays as it was; --resume makes the choices again")
+            return load_model(path)
+        told("interrupted: all that was learned is kept, fade and expected error are the defaults")
+    model = export(model, path, overwrite=True)
+    console.print(f"wrote {path}")
     return model
 
 

@@ -99,7 +99,9 @@ def parser() -> argparse.ArgumentParser:
         help=f"a model file, a bundled model ({', '.join(bundled_models())}; default the one that "
         f"fits the labels), or a baseline: {', '.join(BASELINES)}",
     )
-    tracked.add_argument("-o", "--output", required=True, type=Path, help="OUT.trc, .tsv or .csv")
+    tracked.add_argument(
+        "-o", "--output", required=True, type=Path, help="OUT.csv, .trc, .tsv or .c3d"
+    )
     tracked.add_argument(
         "--hand",
         help=f"for a baseline: a hand file, or one of {', '.join(bundled())}; default the one "
@@ -335,7 +337,7 @@ def _summary(result: Tracked, doubt: str | None) -> str:
     for name, text in (
         (Status.OBSERVED, "measured"),
         (Status.PREDICTED, "filled from what was seen in the frame"),
-        (Status.HELD, "held: nothing in the frame determined them"),
+        (Status.HELD, "held: nothing in the frame determined them, or says how far off they are"),
         (Status.REJECTED, "measured at a wrong place, it seems, and filled (see --no-gate)"),
     ):
         share = 100 * (status == name).mean()
@@ -353,7 +355,7 @@ def _summary(result: Tracked, doubt: str | None) -> str:
     hidden = seen & ((status == Status.PREDICTED) | (status == Status.REJECTED))
     if hidden.any():
         error = 1e3 * result.expected_error[hidden].mean()
-        lines.append(f"filled markers are expected to be {error:.0f} mm off on average")
+        lines.append(f"filled ones, seen before, are expected to be {error:.0f} mm off on average")
     never = ~seen[-1] & result.recording.visible.any(0)
     if never.any():
         names = np.array(result.recording.names)[never]

@@ -57,9 +57,9 @@ def advance(
     """The state after a frame of clean input."""
     own, accepted = state.gate, visible
     if model.gate:
-        own, accepted = gate.step(
-            model, state.gate, markers, visible, state.output, state.tracked, dt
-        )
+        # What holds markers, or lets them fly on, says nothing of where one comes back.
+        told = state.tracked & PREDICTORS[model.predictor].uses_frame
+        own, accepted = gate.step(model, state.gate, markers, visible, state.output, told, dt)
         if accepted is not visible:
             markers = np.where(accepted[..., None], markers, 0)
     seen = sight(model.hand, model.body, accepted, markers.dtype)

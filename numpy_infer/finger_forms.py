@@ -39,17 +39,19 @@ JOINT_AXES = np.stack(
 BASE_ANGLES = np.array([[i for i, a in enumerate(ANGLES) if a.joint == j] for j in JOINTS[1::3]])
 """`[5, 3]` the angles of each finger's base: about its x, y and z."""
 
-_OUTER = (
+_BEYOND_BASE = (
     ("thumb_mcp_flexion", "thumb_mcp_abduction", "thumb_ip_flexion"),
     *((f"{finger}_pip_flexion", None, f"{finger}_dip_flexion") for finger in FINGERS[1:]),
 )
 _NAMES = [angle.name for angle in ANGLES]
-OUTER_ANGLES = np.array([[_NAMES.index(name or row[0]) for name in row] for row in _OUTER])
+OUTER_ANGLES = np.array([[_NAMES.index(name or row[0]) for name in row] for row in _BEYOND_BASE])
 """`[5, 3]` the angles beyond each finger's base: of its middle joint flexion and abduction, which
 only a thumb has, and flexion of its last joint."""
 FLEXIONS = OUTER_ANGLES[:, [0, 2]]
 
-_TURNING = SIGNS[OUTER_ANGLES] * np.array([[name is not None for name in row] for row in _OUTER])
+_TURNING = SIGNS[OUTER_ANGLES] * np.array(
+    [[name is not None for name in row] for row in _BEYOND_BASE]
+)
 _SIGNED_CROSS = np.stack(
     [
         (SIGNS[:, None, None] * CROSS)[BASE_ANGLES],
@@ -180,13 +182,11 @@ class FingerWaves(NamedTuple):
     the same axes: to points the base, to rotations nothing."""
     base_by_axes: Array
     """`[15]` metres: the bases, each by its finger's axes."""
-    bare: Array | None
-    """`[5, 1]` True for a finger without a marker; None if all have one."""
     ends: Array
     """`[3M, 15]` from all markers to the outermost of each finger, by its axes."""
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def finger_waves(hand: Hand) -> FingerWaves:
     """The tables of a hand's bones and markers."""
     forms, base = finger_forms(hand), hand.skeleton[1:16:3]
@@ -203,13 +203,11 @@ def finger_waves(hand: Hand) -> FingerWaves:
     base = (base[:, None] @ BASE_AXES)[:, 0]
     bases = np.zeros((5, 3, 13))
     bases[..., 9:] = base[..., None]
-    bare = hand.end_markers[1][:, None] == 0
     return FingerWaves(
         beyond=_PRODUCTS @ beyond.reshape(5, 27, 42),
         square=_PRODUCTS @ np.stack([square, by_first, by_last], -1).reshape(5, 27, 3),
         bases=bases,
         base_by_axes=base.reshape(15),
-        bare=bare if bare.any() else None,
         ends=ends.reshape(-1, 15),
     )
 

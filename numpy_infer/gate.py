@@ -201,7 +201,8 @@ def step(
         markers: `[..., M, 3]` metres, world, of a left hand; 0 where hidden.
         visible: `[..., M]` True where measured.
         last: `[..., M, 3]` metres, world: the tracker's previous output.
-        tracked: `[...]` True once the hand has been tracked, so that `last` means something.
+        tracked: `[...]` True once the hand has been tracked by a predictor that goes by the frame,
+            so that `last` means something.
         dt: `[...]` seconds since the previous frame, not negative. At 0 nothing that runs on time
             moves, and the same markers again change nothing.
 
@@ -265,7 +266,9 @@ def ahead(
         )
         found = _carefully(model, found, markers[at], visible[at], markers[at], tracked, dt[at])
         level[at] = np.where(restless[at], found.restless, 0)
-        passed = _until((found.accepted != visible[at]).any(-1))
+        # Where the gate gave way it has no velocity of its own for a marker.
+        otherwise = (found.velocity != speed[at]).any((-1, -2))
+        passed = _until((found.accepted != visible[at]).any(-1) | otherwise)
         count = int(at[passed]) if passed < len(at) else count
     if not count:
         return state, 0

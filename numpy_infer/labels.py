@@ -44,7 +44,7 @@ def tracked_without(hand: Hand, absent: Collection[str]) -> bool:
     all, and those left determine where it is."""
     left = np.array([name not in absent for name in hand.markers])
     few = (~left).sum() <= DISPENSABLE * len(hand)
-    return bool(few and second_extent(hand.template, left) > DETERMINED_EXTENT)
+    return bool(few and second_extent(hand.template, left.astype(float)) > DETERMINED_EXTENT)
 
 
 def prefixed(recording: Recording, prefix: str, hand: Hand) -> Recording:
@@ -62,7 +62,10 @@ def prefixed(recording: Recording, prefix: str, hand: Hand) -> Recording:
     markers = np.full((len(own.time), len(hand), 3), np.nan)
     markers[:, [wanted.index(name) for name in own.names]] = own.markers
     filled = tuple(name.removeprefix(prefix) for name in own.filled)
-    return replace(own, names=hand.markers, markers=markers, filled=filled)
+    # What tracking said of the file's own markers is of another table.
+    return replace(
+        own, names=hand.markers, markers=markers, status=None, expected_error=None, filled=filled
+    )
 
 
 def fitting_hand(labels: Collection[str]) -> Hand | None:

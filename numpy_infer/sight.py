@@ -14,7 +14,7 @@ from numpy_infer.pose import DETERMINED_EXTENT
 
 
 class Sight(NamedTuple):
-    """Of one visible set `[..., M]`; all arrays are read only."""
+    """Of one visible set `[..., M]`; it is kept, so nobody may write into its arrays."""
 
     weight: Array
     """`[..., M]` 1 where visible, else 0."""
@@ -32,18 +32,28 @@ class Sight(NamedTuple):
     a larger one of the body's, that no prior is needed."""
 
 
+KEPT = 256
+"""Markers of all hands: of more the visible set seldom stays, and what follows from it takes
+kilobytes each."""
+
+
 def sight(hand: Hand, body: Hand, visible: Array, dtype: np.dtype) -> Sight:
     """Of markers `[..., M]` that are visible now, in the precision of `dtype`."""
-    return _sight(hand, body, dtype.char, visible.shape, visible.tobytes())
+    if visible.size > KEPT:
+        return _of(hand, body, dtype.char, visible)
+    return _kept(hand, body, dtype.char, visible.shape, visible.tobytes())
 
 
-@lru_cache(maxsize=16)  # of hundreds of hands one takes megabytes
-def _sight(hand: Hand, body: Hand, dtype: str, shape: tuple[int, ...], seen: bytes) -> Sight:
-    visible = np.frombuffer(seen, bool).reshape(shape)
+@lru_cache(maxsize=64)
+def _kept(hand: Hand, body: Hand, dtype: str, shape: tuple[int, ...], seen: bytes) -> Sight:
+    return _of(hand, body, dtype, np.frombuffer(seen, bool).reshape(shape))
+
+
+def _of(hand: Hand, body: Hand, dtype: str, visible: Array) -> Sight:
     weight = visible.astype(dtype)
     direct = bool(visible[..., hand.aligned].all())
     templates = np.array([hand.template, body.template][: 1 + direct], dtype)
-    weights = np.empty((*shape[:-1], 1 + direct, shape[-1]), dtype)
+    weights = np.empty((*visible.shape[:-1], 1 + direct, len(hand)), dtype)
     weights[..., 1:, :], weights[..., 0, :] = hand.alignment_weight, weight
     both = folded(templates, weights)
     return Sight(
@@ -56,7 +66,7 @@ def _sight(hand: Hand, body: Hand, dtype: str, shape: tuple[int, ...], seen: byt
     )
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def aligned(hand: Hand, body: Hand, dtype: str) -> Folded:
     """The body by the hand's alignment markers: what gives the wrist's pose once every marker is
     somewhere."""

@@ -243,10 +243,8 @@ def place_fingers(
     turn, own = turn.reshape(*batch, 5, 3, 3), own.reshape(*batch, 5, 3, 14)
     if markers is not None:
         modelled = (turn @ own[..., 13:])[..., 0]
-        measured = _towards(fingers, markers)
-        if fingers.bare is not None:
-            measured = np.where(fingers.bare, modelled, measured)
-        turn = shortest_arc(modelled, measured) @ turn
+        # Of a finger without a marker the modelled way has no length, and turns nothing.
+        turn = shortest_arc(modelled, _towards(fingers, markers)) @ turn
         base_angles = _euler(turn) * _BASE_SIGNS.astype(dtype, copy=False)
         angles = np.concatenate([angles, base_angles.reshape(*batch, 15)], -1)
         angles = angles.take(_WITH_BASE_ANGLES, -1)

@@ -124,10 +124,11 @@ def _tracked(recording: Recording, model: Model, poses: Sequence[HandPose]) -> T
     begun = np.logical_or.accumulate(state == TrackingState.TRACKING)
     if model.predictor == "none":
         markers = np.where((status == Status.OBSERVED)[..., None], markers, np.nan)
-    some = (status != Status.OBSERVED).any(0)
+    markers = np.where(begun[:, None, None], markers, np.nan)
+    some = ((status != Status.OBSERVED) & np.isfinite(markers).all(-1)).any(0)
     filled = replace(
         recording,
-        markers=np.where(begun[:, None, None], markers, np.nan),
+        markers=markers,
         angles=None if angles is None else np.where(begun[:, None], angles, np.nan),
         joints=None,
         status=status,

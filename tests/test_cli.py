@@ -174,6 +174,7 @@ def test_a_filled_table_says_what_was_measured_and_how_far_off_the_rest_may_be(
     markers[:5] = markers[10:20, 3] = markers[15:, 7] = np.nan
     write(replace(recording, markers=markers), tmp_path / "gap.csv")
     result = track(read("gap.csv"), load("glove9"))
+    assert not result.expected_error[:5].any()
     for option in ([], ["--as-measured"]):
         assert main(["track", "gap.csv", "-o", "out.csv", "--overwrite", *option]) == 0
         lines = Path("out.csv").read_text().splitlines()
@@ -183,8 +184,11 @@ def test_a_filled_table_says_what_was_measured_and_how_far_off_the_rest_may_be(
             told = np.array([[float(row[i] or "nan") for i in columns] for row in rows])
             np.testing.assert_allclose(told[5:], wanted[5:], rtol=0, atol=1e-6)
             assert told[5:].any()
-        assert np.isnan(told[:5]).all(), "no error is known of what is blank"
+            assert np.isnan(told[:5]).all(), "of what is blank nothing is known"
         assert read("out.csv").names == HAND.markers
+        assert (
+            read("out.csv").filled == result.recording.filled == (HAND.markers[3], HAND.markers[7])
+        )
 
 
 def test_fingers_bent_backwards_are_told_of(capsys: pytest.CaptureFixture[str]) -> None:
@@ -250,7 +254,7 @@ def test_what_to_expect_is_said_of_markers_that_were_seen() -> None:
         HAND.markers, markers, time, 60.0, source="", status=status, expected_error=off
     )
     said = _summary(Tracked(made, np.zeros(4), np.zeros(4, int)), None)
-    assert "expected to be 5 mm off" in said
+    assert "filled ones, seen before, are expected to be 5 mm off" in said
     assert f"never seen: {', '.join(HAND.markers[3:])}; filled" in said
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from conftest import REFERENCE, Side
 from hypothesis import given
+from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 from strategies import HIGH, LOW, Array, joint_angles, motions, weights
 
@@ -83,6 +84,17 @@ def test_placed_fingers_are_what_forward_kinematics_makes_of_their_angles(
     assert_array_equal(found.angles, side.cast(angles))
     assert_allclose(found.positions, positions, rtol=0, atol=side.metres)
     assert_allclose(found.rotations, turns, rtol=0, atol=side.metres)
+
+
+@given(angles=joint_angles(), other=joint_angles(), far=st.floats(1, 1e7))
+def test_angles_that_are_no_hands_make_rotations(
+    side: Side, angles: Array, other: Array, far: float
+) -> None:
+    """As a network may give them that was shown no hand."""
+    exact = placed(side, GLOVE, other)
+    for markers in (None, exact.markers):
+        turns = placed(side, GLOVE, far * angles, markers).rotations.astype(float)
+        assert_allclose(turns @ turns.swapaxes(-1, -2), EYE + 0 * turns, rtol=0, atol=side.metres)
 
 
 @pytest.mark.parametrize("name", HANDS)

@@ -107,6 +107,14 @@ def test_markers_come_by_name_and_what_has_no_label_is_never_seen(
         np.testing.assert_array_equal(markers, np.broadcast_to(wanted, (4, 3)))
 
 
+def test_what_was_tracked_once_may_lack_labels_as_well() -> None:
+    said = np.zeros((1, len(GLOVE)))
+    file = replace(recording(GLOVE.markers, GLOVE.template[None]), status=said, expected_error=said)
+    own = prefixed(file.select(GLOVE.markers[1:]), "", GLOVE)
+    assert own.names == GLOVE.markers
+    assert own.status is None
+
+
 def test_a_prefix_that_no_label_has_is_an_error() -> None:
     file = recording(GLOVE.markers, GLOVE.template[None])
     with pytest.raises(ValueError, match="no label begins with 'L_'; there are pinky_base, "):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
@@ -10,6 +12,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from strategies import any_points, masks, motions, spread_points, turn
 from streams import a_model, motion, moved, postures, seeds
 
+from numpy_infer import tracker
+from numpy_infer.pose import Status
 from numpy_infer.predictors import (
     AVERAGE_SECONDS,
     PREDICTORS,
@@ -286,3 +290,18 @@ def test_predictors_take_any_leading_axes(data: st.DataObject) -> None:
             many, last_many = step(model, many, markers, visible, last_many, dt)
             one, last_one = step(model, one, markers[1, 2], visible[1, 2], last_one, dt[1, 2])
             assert_allclose(last_many[1, 2], last_one, rtol=0, atol=1e-5)
+
+
+@every
+def test_what_comes_back_is_believed_by_a_gate_that_cannot_know_better(predictor: str) -> None:
+    """What holds a marker, or lets it fly on, does not say where the hand has carried it since."""
+    model = replace(a_model(predictor), gate=True)
+    rng, frames, hidden = np.random.default_rng(5), 90, slice(30, 50)
+    time = np.arange(frames)[:, None, None] / 60
+    truth = model.hand.template + time * [0.8, 0.3, 0] + 2e-4 * rng.standard_normal((frames, 9, 3))
+    visible = np.ones((frames, 1, 9), bool)
+    visible[hidden, :, 0] = False
+    state = tracker.init(model, (1,))
+    for markers, seen in zip(truth[:, None], visible, strict=True):
+        state, pose = tracker.step(model, state, markers, seen, np.full(1, 1 / 60))
+        assert not (pose.status == Status.REJECTED).any()

@@ -110,14 +110,15 @@ def test_what_tracking_says_is_written_beside_the_markers(
     got = read(path)
     assert_same(got, recording, 0.0)
     np.testing.assert_array_equal(got.time, recording.time)
-    assert got.filled == tuple(np.array(recording.names)[status.any(0)])
+    made_up = (recording.visible & (status > 0)).any(0)
+    assert got.filled == tuple(np.array(recording.names)[made_up])
     lines = path.read_text("utf-8").splitlines()
     assert "# status: 0 observed, 1 predicted, 2 held, 3 rejected" in lines
     header, *rows = (line.split(",") for line in lines if not line.startswith("#"))
     for i, name in enumerate(recording.names):
         for wanted, kind in ((status, "status"), (off, "expected_error")):
             column = [row[header.index(f"{name}.{kind}")] for row in rows]
-            blank = ~recording.visible[:, i] & (kind == "expected_error")
+            blank = ~recording.visible[:, i]
             told = np.array([float(cell or "nan") for cell in column])
             np.testing.assert_array_equal(told, np.where(blank, np.nan, wanted[:, i]))
     chosen = replace(recording, status=status, expected_error=off).select(recording.names[::-1])

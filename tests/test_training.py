@@ -352,6 +352,30 @@ def test_a_run_leaves_a_model_and_goes_on(tmp_path: Path, monkeypatch: pytest.Mo
     assert more.training["marker_network"]["epochs"] == 2
 
 
+def test_what_is_interrupted_while_it_is_finished_replaces_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = make_dataset("a", TRAINING, 1.0, 1.1)
+    monkeypatch.setattr(training_data, "load", lambda spec, split, **_: given)
+    config = replace(CONFIG, data=("a",), out=tmp_path / "run", epochs=1, joints=False)
+
+    def interrupt(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(training, "finish", interrupt)
+        training.train(config)
+    path = tmp_path / "run" / "model.npz"
+    model_file.save(replace(model_file.load(path), fade=0.5), path, overwrite=True)
+    before = path.read_bytes()
+    with monkeypatch.context() as patched:
+        patched.setattr(training, "finish", interrupt)
+        assert training.train(replace(config, resume=True)).fade == 0.5
+    assert path.read_bytes() == before
+    training.train(replace(config, resume=True))
+    assert path.read_bytes() != before
+
+
 # --- what is refused
 
 

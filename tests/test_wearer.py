@@ -12,7 +12,8 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from streams import Stream, a_model, motion, restless, run
 
-from numpy_infer import HandTracker, load_hand, model, wearer
+from numpy_infer import HandTracker, load_hand, model, tracker, wearer
+from numpy_infer.geometry import kabsch, rotation_from_vector, transform
 from numpy_infer.hand import ANGLES
 from numpy_infer.skeleton import rotations_from_angles
 from numpy_infer.wearer import Wearer
@@ -112,6 +113,36 @@ def test_a_larger_hand_that_is_known_to_be_is_the_same_hand() -> None:
     assert_allclose(scaled.positions, factor * pose.positions, rtol=0, atol=1e-5)
     assert_allclose(scaled.angles, pose.angles, rtol=0, atol=1e-4)
     assert_allclose(scaled.wrist_position, factor * pose.wrist_position, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("hidden", [(), ("thumb_tip",), ("wrist",)])
+def test_the_wrist_is_where_the_wearers_markers_have_it(hidden: tuple[str, ...]) -> None:
+    """Whichever way it is found: beside the registration, or by itself once all is filled."""
+    lengths = np.random.default_rng(3).uniform(0.7, 1.3, (len(GLOVE.skeleton), 1))
+    model = wearer.worn_by(a_model("last_known"), GLOVE.with_skeleton(lengths * GLOVE.skeleton))
+    assert np.abs(model.body.template - model.hand.template)[GLOVE.aligned].max() > 2e-3
+    rotation, position = rotation_from_vector(np.array([0.3, -0.5, 0.8])), np.array([1, 2, 3.0])
+    live = HandTracker(model)
+    markers = transform(rotation, position, model.body.template)
+    live.step(markers, 1 / 60)
+    pose = live.step(markers, 1 / 60, ~np.isin(GLOVE.markers, hidden))
+    assert_allclose(pose.wrist_rotation, rotation, rtol=0, atol=1e-7)
+    assert_allclose(pose.wrist_position, position, rtol=0, atol=1e-7)
+
+
+def test_what_alignment_markers_near_a_line_leave_open_of_the_wrist_follows_the_others() -> None:
+    model, markers = wearer.worn_by(a_model("last_known"), LARGER), LARGER.template.copy()
+    first, second, *others = GLOVE.aligned
+    along = markers[second] - markers[first]
+    for i in others:
+        markers[i] = markers[first] + along * 0.4 + 1e-5
+    state = tracker.init(model)
+    dt, seen = np.array(1 / 60), np.ones(len(GLOVE), bool)
+    for _ in range(2):
+        state, pose = tracker.step(model, state, markers, seen, dt)
+        wanted = kabsch(LARGER.template, markers, GLOVE.alignment_weight, state.rotation)
+        assert_allclose(pose.wrist_rotation, wanted[0], rtol=0, atol=1e-6)
+        assert_allclose(pose.wrist_position, wanted[1], rtol=0, atol=1e-6)
 
 
 def test_one_wearer_after_another_is_the_other_alone() -> None:

@@ -59,6 +59,13 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     else:
         rate = median_rate(time, path)
     markers, _ = hide_gaps(table[:, columns] * scale, zeros=False)
+    seen = np.isfinite(markers).all(-1)
+    # A blank cell rests on nothing, whatever its status.
+    filled = tuple(
+        name
+        for name, there in zip(names, seen.T, strict=True)
+        if name in status and (table[there, status[name]] > 0).any()
+    )
     recording = Recording(
         names=names,
         markers=markers,
@@ -66,7 +73,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         rate=rate,
         source=str(path),
         unit=scale,
-        filled=tuple(n for n in names if n in status and (table[:, status[n]] > 0).any()),
+        filled=filled,
         notes=file.notes + notes,
     )
     return recording.reflected() if left_handed else recording
@@ -90,7 +97,8 @@ def write(recording: Recording, path: Path) -> None:
     if recording.status is not None:
         comments.append("# status: " + ", ".join(f"{s.value} {s.name.lower()}" for s in Status))
         columns += [f"{name}.status" for name in recording.names]
-        table = np.concatenate([table, recording.status], -1)
+        status = np.where(recording.visible, recording.status, np.nan)
+        table = np.concatenate([table, status], -1)
     if recording.expected_error is not None:
         columns += [f"{name}.expected_error" for name in recording.names]
         expected = np.where(recording.visible, recording.expected_error, np.nan)
