@@ -185,9 +185,16 @@ def occlusions_picture(
         duration.stairs(shares, edges, color=colour, linewidth=2, label=label)
     number.set(xlabel="markers hidden at once", ylabel="share of frames", yscale="log")
     duration.set(xlabel="gap (s)", ylabel="share of gaps", xscale="log", yscale="log")
+    most = max(np.flatnonzero(table.hidden).max(initial=0) for table in tables.values())
+    number.set(xlim=(-0.6, most + 0.6), xticks=range(most + 1))
+    least = min(1 / max(table.gaps, 10) for table in tables.values())
+    duration.set_ylim(10 ** np.floor(np.log10(least)), 4)
     for panel in (number, duration):
         panel.spines[["top", "right"]].set_visible(False)
-        panel.legend(frameon=False, fontsize=10)
+        panel.legend(frameon=False, fontsize=10, loc="upper right")
+    for axis in (number.yaxis, duration.yaxis, duration.xaxis):
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter("")
     _save(figure, path)
 
 
@@ -335,7 +342,7 @@ def _scale_bar(panel: Any) -> None:
     """5 cm, below the hand."""
     left, bottom = panel.get_xlim()[0], panel.get_ylim()[0]
     panel.plot([left, left + 5], [bottom, bottom], color=TRUTH, linewidth=2)
-    panel.text(left + 2.5, bottom + 0.4, "5 cm", ha="center", va="bottom", fontsize=9)
+    panel.text(left + 2.5, bottom - 0.3, "5 cm", ha="center", va="top", fontsize=9)
 
 
 def _height(
