@@ -88,8 +88,9 @@ def parser() -> argparse.ArgumentParser:
         "track",
         help="fill the holes of a recording, and solve the joints",
         description="Runs the tracker over a recording and writes all markers; a .csv also holds "
-        "the joint angles and, of each marker, what it rests on (NAME.status, numbers as its first "
-        "lines say) and the metres that it is expected to be off (NAME.expected_error). "
+        "the joint angles, the wrist's pose (metres, and a quaternion) and, of each marker, what "
+        "it rests on (NAME.status, as its first lines say) and the metres that it is expected to "
+        "be off (NAME.expected_error). "
         "Example: jaxhand track take.trc --model model.npz -o filled.csv",
     )
     _add_file(tracked)

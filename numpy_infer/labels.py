@@ -62,10 +62,9 @@ def prefixed(recording: Recording, prefix: str, hand: Hand) -> Recording:
     markers = np.full((len(own.time), len(hand), 3), np.nan)
     markers[:, [wanted.index(name) for name in own.names]] = own.markers
     filled = tuple(name.removeprefix(prefix) for name in own.filled)
-    # What tracking said of the file's own markers is of another table.
-    return replace(
-        own, names=hand.markers, markers=markers, status=None, expected_error=None, filled=filled
-    )
+    # What tracking said was of other markers.
+    own = replace(own, angles=None, wrist=None, status=None, expected_error=None)
+    return replace(own, names=hand.markers, markers=markers, filled=filled)
 
 
 def fitting_hand(labels: Collection[str]) -> Hand | None:

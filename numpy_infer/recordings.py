@@ -81,6 +81,7 @@ class Recording:
     unit: metres in one unit of the file.
     joints: joint truth, if the file has any.
     angles: [T, 26] radians, in the order of `hand.ANGLES`: what tracking made of the markers.
+    wrist: [T, 7] of the wrist joint metres, and the quaternion xyzw of its rotation: likewise.
     status: [T, M] a `pose.Status` each: what tracking says that a marker rests on.
     expected_error: [T, M] metres: how far off tracking expects it to be; 0 where observed.
     filled: names whose values are partly made up, by the recording software or by tracking.
@@ -95,6 +96,7 @@ class Recording:
     unit: float = 1.0
     joints: JointTruth | None = None
     angles: np.ndarray | None = None
+    wrist: np.ndarray | None = None
     status: np.ndarray | None = None
     expected_error: np.ndarray | None = None
     filled: tuple[str, ...] = ()
@@ -121,6 +123,8 @@ class Recording:
             raise ValueError(
                 f"joints: expected {len(self.time)} frames, got {len(self.joints.positions)}"
             )
+        if self.wrist is not None:
+            _check_shape("wrist", self.wrist, (len(self.time), 7))
         for field in ("status", "expected_error"):
             if getattr(self, field) is not None:
                 _check_shape(field, getattr(self, field), self.markers.shape[:2])
@@ -156,7 +160,9 @@ class Recording:
     def reflected(self) -> Recording:
         """The recording with z negated: from a left-handed to a right-handed frame, or back."""
         joints = None if self.joints is None else self.joints.reflected()
-        return replace(self, markers=self.markers * _REFLECT_Z, joints=joints)
+        # Of a rotation the axis is mirrored, and turned about the other way.
+        wrist = None if self.wrist is None else self.wrist * [1, 1, -1, -1, -1, 1, 1]
+        return replace(self, markers=self.markers * _REFLECT_Z, joints=joints, wrist=wrist)
 
 
 def read(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from numpy_infer.arrays import Array
+from numpy_infer.geometry import quaternion
 from numpy_infer.model import Model
 from numpy_infer.pose import HandPose, Status, TrackingState
 from numpy_infer.recordings import Recording
@@ -25,8 +26,8 @@ class Tracked:
 
     recording: Recording
     """Markers `[T, M, 3]` metres and, with a joint stage, angles `[T, 26]` radians; NaN before the
-    hand was first tracked, and with the predictor `none` wherever nothing was measured. Of every
-    marker its status and expected error."""
+    hand was first tracked, and with the predictor `none` wherever nothing was measured. The wrist's
+    pose, and of every marker its status and expected error."""
     state: Array
     """`[T]` a `TrackingState` for each frame."""
     notice: Array
@@ -126,11 +127,13 @@ def _tracked(recording: Recording, model: Model, poses: Sequence[HandPose]) -> T
         markers = np.where((status == Status.OBSERVED)[..., None], markers, np.nan)
     markers = np.where(begun[:, None, None], markers, np.nan)
     some = ((status != Status.OBSERVED) & np.isfinite(markers).all(-1)).any(0)
+    wrist = np.concatenate([of("wrist_position"), quaternion(of("wrist_rotation"))], -1)
     filled = replace(
         recording,
         markers=markers,
         angles=None if angles is None else np.where(begun[:, None], angles, np.nan),
         joints=None,
+        wrist=np.where(begun[:, None], wrist, np.nan),
         status=status,
         expected_error=np.where(begun[:, None], of("expected_error"), 0),
         filled=tuple(np.array(recording.names)[some].tolist()),

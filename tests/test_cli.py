@@ -15,6 +15,7 @@ import pytest
 import numpy_infer.cli
 from numpy_infer import load_hand
 from numpy_infer.cli import _summary, check_output, main
+from numpy_infer.formats.plain_csv import WRIST
 from numpy_infer.hand import ANGLES
 from numpy_infer.model import load
 from numpy_infer.pose import Status, TrackingState
@@ -185,6 +186,9 @@ def test_a_filled_table_says_what_was_measured_and_how_far_off_the_rest_may_be(
             np.testing.assert_allclose(told[5:], wanted[5:], rtol=0, atol=1e-6)
             assert told[5:].any()
             assert np.isnan(told[:5]).all(), "of what is blank nothing is known"
+        wrist = [[float(row[header.index(c)] or "nan") for c in WRIST] for row in rows]
+        np.testing.assert_allclose(wrist, result.recording.wrist, rtol=0, atol=1e-9)
+        assert np.isfinite(wrist[5:]).all()
         assert read("out.csv").names == HAND.markers
         assert (
             read("out.csv").filled == result.recording.filled == (HAND.markers[3], HAND.markers[7])

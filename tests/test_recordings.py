@@ -105,8 +105,9 @@ def test_what_tracking_says_is_written_beside_the_markers(
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
     status, off = rng.integers(len(Status), size=shape), rng.random(shape).round(6)
     status[:, 0] = 0
+    wrist = rng.standard_normal((len(status), 7)).round(9)
     path = tmp_path_factory.mktemp("round") / "take.csv"
-    write(replace(recording, status=status, expected_error=off), path)
+    write(replace(recording, wrist=wrist, status=status, expected_error=off), path)
     got = read(path)
     assert_same(got, recording, 0.0)
     np.testing.assert_array_equal(got.time, recording.time)
@@ -115,6 +116,9 @@ def test_what_tracking_says_is_written_beside_the_markers(
     lines = path.read_text("utf-8").splitlines()
     assert "# status: 0 observed, 1 predicted, 2 held, 3 rejected" in lines
     header, *rows = (line.split(",") for line in lines if not line.startswith("#"))
+    first = header.index("wrist_x.pose")
+    assert header[first + 6] == "wrist_qw.pose"
+    np.testing.assert_array_equal(np.array([row[first : first + 7] for row in rows], float), wrist)
     for i, name in enumerate(recording.names):
         for wanted, kind in ((status, "status"), (off, "expected_error")):
             column = [row[header.index(f"{name}.{kind}")] for row in rows]
@@ -230,6 +234,7 @@ def test_a_half_hidden_marker_is_written_as_a_gap(
         ({"names": ("a", "a")}, "duplicate marker name 'a'"),
         ({"names": ("a",)}, r"markers: expected shape \(3, 1, 3\), got \(3, 2, 3\)"),
         ({"status": np.zeros((3, 1))}, r"status: expected shape \(3, 2\), got \(3, 1\)"),
+        ({"wrist": np.zeros((3, 6))}, r"wrist: expected shape \(3, 7\), got \(3, 6\)"),
         ({"markers": np.zeros((3, 2))}, "markers: expected shape"),
         ({"time": [0.0, np.nan, 1.0]}, "time: frame 1"),
         ({"time": [0.0, 1.0]}, "markers: expected shape"),

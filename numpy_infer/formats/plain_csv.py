@@ -34,8 +34,10 @@ from numpy_infer.hand import ANGLES
 from numpy_infer.pose import Status
 from numpy_infer.recordings import Recording, median_rate
 
-TRACKED = (".deg", ".status", ".expected_error")
+TRACKED = (".deg", ".pose", ".status", ".expected_error")
 """Endings of columns that tracking adds."""
+WRIST = tuple(f"wrist_{part}.pose" for part in ("x", "y", "z", "qx", "qy", "qz", "qw"))
+"""Columns of `Recording.wrist`."""
 
 
 def read(path: Path, *, unit: float | None = None, left_handed: bool = False) -> Recording:
@@ -80,8 +82,9 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
 
 
 def write(recording: Recording, path: Path) -> None:
-    """Write metres with every digit, and what tracking says: angles in degrees, of each marker what
-    it rests on, and to the micrometre how far off to expect it. Gaps are blank."""
+    """Write metres with every digit, and what tracking says: angles in degrees, the wrist's pose to
+    the nanometre, of each marker what it rests on, and to the micrometre how far off to expect it.
+    Gaps are blank."""
     check_writable(recording.names)
     columns = [f"{name}.{axis}" for name in recording.names for axis in "xyz"]
     markers = np.where(recording.visible[..., None], recording.markers, np.nan)
@@ -89,6 +92,9 @@ def write(recording: Recording, path: Path) -> None:
     if recording.angles is not None:
         columns += [f"{angle.name}.deg" for angle in ANGLES]
         table = np.concatenate([table, np.degrees(recording.angles)], -1)
+    if recording.wrist is not None:
+        columns += WRIST
+        table = np.concatenate([table, recording.wrist.round(9)], -1)
     comments = [
         "# unit: m",
         f"# rate: {number(recording.rate)}",
