@@ -62,7 +62,7 @@ class CalibrateConfig(_File):
     """The command line of `jaxhand calibrate`."""
 
     model: Path
-    """The model that will track this person."""
+    """The model that will track this person: a file, or the name of a bundled one."""
     flat: tuple[float, float] | None = None
     """Seconds from and to which a flat hand is held, fingers together: what the joint network makes
     of it is then taken off all it says (paper, section 2.2)."""

@@ -114,9 +114,9 @@ class TrainingConfig:
     epochs: int = 300
     """The most epochs for each network."""
     start: Path | None = None
-    """A model to go on from, with its hand and its layers: recordings of your own then refine it,
-    the marker network as far as is good on validation. Networks that the data say nothing of stay
-    as they are."""
+    """A model to go on from, a file or the name of a bundled one, with its hand and its layers:
+    recordings of your own then refine it, the marker network as far as is good on validation.
+    Networks that the data say nothing of stay as they are."""
     seed: int = 0
     """The same seed gives the same numbers on the same machine."""
     resume: bool = False

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from numpy_infer import wearer
-from numpy_infer.hand import ANGLES, Hand, bundled, load_hand
+from numpy_infer.hand import ANGLES, POINTS, Hand, bundled, load_hand
 from numpy_infer.labels import doubted_unit, fitting_hand, labels_of, lacking, prefixed, unfitting
 from numpy_infer.model import Model, load
 from numpy_infer.model import bundled as bundled_models
@@ -407,7 +407,24 @@ def _hands(options: argparse.Namespace) -> None:
         return
     for name in bundled():
         hand = load_hand(name)
-        print(f"{name}: {len(hand)} markers: {', '.join(hand.markers)}")
+        print(f"{name}: {len(hand)} markers; those that give the wrist's pose have a star")
+        for i, marker in enumerate(hand.markers):
+            star = "*" if i in hand.alignment else " "
+            print(f"  {marker:14}{star} {_place(hand, i)}")
+
+
+_WAYS = (("radial", "ulnar"), ("dorsal", "palmar"), ("proximal", "distal"))
+"""What +x, +y and +z are called, and their opposites, of a left hand."""
+
+
+def _place(hand: Hand, marker: int) -> str:
+    """Where a marker sits: a joint or tip, and from there how far in which directions."""
+    steps = [
+        f"{abs(along) * 1e3:.0f} mm {ways[int(along < 0)]}"
+        for along, ways in zip(hand.offsets[marker], _WAYS, strict=True)
+        if abs(along) >= 0.5e-3
+    ]
+    return ", ".join([f"at {POINTS[hand.joints[marker]]}", *steps])
 
 
 def _hand_over(verb: str, arguments: list[str]) -> int:

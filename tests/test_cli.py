@@ -195,6 +195,16 @@ def test_a_filled_table_says_what_was_measured_and_how_far_off_the_rest_may_be(
         )
 
 
+def test_hands_say_where_their_markers_sit(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["hands"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    own = lines[lines.index(next(line for line in lines if line.startswith("glove9:"))) + 1 :][:9]
+    found = {line.split()[0].rstrip("*"): line for line in own}
+    assert set(found) == set(HAND.markers)
+    assert found["wrist"].split() == ["wrist", "*", "at", "wrist,", "30", "mm", "dorsal"]
+    assert found["index_tip"].split() == ["index_tip", "at", "index_tip"]
+
+
 def test_fingers_bent_backwards_are_told_of(capsys: pytest.CaptureFixture[str]) -> None:
     recording = Recording(HAND.markers, np.zeros((4, 9, 3)), np.arange(4) / 60, 60.0, source="")
     for degrees, told in ((-45, True), (10, False)):
