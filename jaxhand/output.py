@@ -60,7 +60,7 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
 
 def _expected_error(model: Model, state: State) -> Array:
     """`[..., M]` metres: the marker's share of the model's table by number hidden and change of
-    posture, and what its correction has lost."""
+    posture, and what its correction has lost; of a visible one what is left of its way back."""
     dtype = state.drift.dtype
     table = jnp.asarray(model.expected_error, dtype)
     hidden = (~state.visible).sum(-1)
@@ -72,7 +72,8 @@ def _expected_error(model: Model, state: State) -> Array:
     off = off if model.marker_error is None else off * jnp.asarray(model.marker_error, dtype)
     faded = model.faded_error * (1 - jnp.exp(-state.change / model.fade))
     length = jnp.sqrt((state.correction * state.correction).sum(-1))
-    return jnp.where(state.visible, 0, off + faded[..., None] * length)
+    returning = length if model.continuity else 0
+    return jnp.where(state.visible, returning, off + faded[..., None] * length)
 
 
 def _to_side(pose: HandPose, right: Array) -> HandPose:

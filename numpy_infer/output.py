@@ -81,17 +81,22 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
 
 def _expected_error(model: Model, state: State) -> Array:
     """`[..., M]` metres: the marker's share of the model's table by number hidden and change of
-    posture, and what its correction has lost."""
+    posture, and what its correction has lost; of a visible one what is left of its way back."""
     hidden, dtype = ~state.visible, state.drift.dtype
-    if not np.count_nonzero(hidden):
+    some_hidden = np.count_nonzero(hidden)
+    if not (some_hidden or np.count_nonzero(state.correction)):
         return np.zeros_like(state.drift)
+    length = np.sqrt(squares(state.correction))
+    returning = length if model.continuity else np.zeros_like(length)
+    if not some_hidden:
+        return returning
     row, (changes, errors) = model.error_rows.take(np.add.reduce(hidden, -1)), model.error_line
     gone = np.minimum(state.drift + state.change[..., None], ERROR_CHANGES[-1])
     error = np.interp(gone + row[..., None], changes, errors) * model.error_factors
     if model.faded_error:
         faded = model.faded_error * (1 - np.exp(-state.change / model.fade))
-        error += faded[..., None] * np.sqrt(squares(state.correction))
-    return (error * hidden).astype(dtype, copy=False)
+        error += faded[..., None] * length
+    return np.where(hidden, error, returning).astype(dtype, copy=False)
 
 
 def _to_side(pose: HandPose, right: Array) -> HandPose:

@@ -55,7 +55,8 @@ class HandPose(NamedTuple):
     status: Array
     """`[..., M]` a `Status` for each marker."""
     expected_error: Array
-    """`[..., M]` metres: mean error to expect of the marker; 0 where observed."""
+    """`[..., M]` metres: mean error to expect of the marker; of an observed one how far it still is
+    from there, on its way back."""
     wrist_rotation: Array
     """`[..., 3, 3]` world_from_wrist of the hand given; a right hand's is its mirror image's."""
     wrist_position: Array

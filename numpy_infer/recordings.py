@@ -83,7 +83,7 @@ class Recording:
     angles: [T, 26] radians, in the order of `hand.ANGLES`: what tracking made of the markers.
     wrist: [T, 7] of the wrist joint metres, and the quaternion xyzw of its rotation: likewise.
     status: [T, M] a `pose.Status` each: what tracking says that a marker rests on.
-    expected_error: [T, M] metres: how far off tracking expects it to be; 0 where observed.
+    expected_error: [T, M] metres: how far off tracking expects it to be.
     filled: names whose values are partly made up, by the recording software or by tracking.
     notes: one-line things that the reader wants the user to know.
     """

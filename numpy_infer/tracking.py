@@ -107,9 +107,11 @@ def as_measured(result: Tracked, recording: Recording) -> Tracked:
     """The same with what was measured, and believed, as it was: a marker that comes back then jumps
     to where it is instead of being led there."""
     own = recording.select(result.recording.names)
-    seen = (result.status == Status.OBSERVED)[..., None]
-    markers = np.where(seen, own.markers, result.recording.markers)
-    return replace(result, recording=replace(result.recording, markers=markers))
+    seen = result.status == Status.OBSERVED
+    markers = np.where(seen[..., None], own.markers, result.recording.markers)
+    off = np.where(seen, 0, result.expected_error)
+    own = replace(result.recording, markers=markers, expected_error=off)
+    return replace(result, recording=own)
 
 
 def _part(report: Callable[[float], None], number: int, of: int, share: float) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -52,6 +54,20 @@ def test_it_grows_as_the_posture_goes_on_and_with_what_the_correction_has_lost()
     assert state.drift[0, 3] > 0.001
     assert state.drift[0, 7] == 0
     assert state.change > 0.001
+
+
+@pytest.mark.parametrize("continuity", [True, False])
+def test_what_is_on_its_way_back_is_off_by_what_is_left_of_it(continuity: bool) -> None:
+    model = replace(a_model("learned", expected_error=TABLE), continuity=continuity)
+    rng = np.random.default_rng(2)
+    markers = motion(model.hand, rng, 60, 1)
+    visible = np.ones((60, 1, 9), bool)
+    visible[5:40, :, [3, 6]] = False
+    state = tracker.init(model, (1,))
+    _, pose = tracker.run(model, state, markers, visible, np.full((60, 1), 1 / 60))
+    off = np.linalg.norm(pose.markers - markers, axis=-1)
+    np.testing.assert_allclose(pose.expected_error[visible], off[visible], atol=1e-9)
+    assert (off[40:, 0, 3] > 1e-3).any() == continuity
 
 
 def some_samples(seed: int) -> tuple[object, Array]:

@@ -97,7 +97,7 @@ def test_a_glove_in_one_file_is_tracked_after_two_commands(
 
     filled = read("filled.csv")
     assert filled.names == hand.markers
-    assert any("48 columns of tracking (.deg, .status" in note for note in filled.notes)
+    assert any("55 columns of tracking (.deg, .pose, .status" in note for note in filled.notes)
     # Untrained it is as far off as the baseline, after these few epochs 0.55 of that.
     assert main(rival.split()) == 0
     assert error("filled.csv") < 0.75 * error("affine.csv")

@@ -13,7 +13,7 @@ from streams import PATTERNS, Stream, a_model, at_least, leaves, motion, run
 
 from numpy_infer import tracker
 from numpy_infer.model import Model
-from numpy_infer.pose import State
+from numpy_infer.pose import State, Status
 
 Array = np.ndarray
 
@@ -78,7 +78,9 @@ def test_a_thousand_frames_with_four_markers_visible_are_the_same_in_jax(predict
     assert_allclose(theirs.markers, ours.markers, rtol=0, atol=1e-4)
     assert_array_equal(theirs.status, ours.status)
     assert_array_equal(theirs.state, ours.state)
-    assert_allclose(theirs.expected_error, ours.expected_error, rtol=0, atol=1e-5)
+    seen = ours.status == Status.OBSERVED
+    for own, within in ((~seen, 1e-5), (seen, 1e-4)):  # those seen are on their way back: places
+        assert_allclose(theirs.expected_error[own], ours.expected_error[own], rtol=0, atol=within)
     if ours.angles is not None:
         # Not the angles: near 90° of abduction, where this random network goes, they are no
         # function of the rotations.
