@@ -205,7 +205,7 @@ def test_hands_say_where_their_markers_sit(capsys: pytest.CaptureFixture[str]) -
     assert found["index_tip"].split() == ["index_tip", "at", "index_tip"]
 
 
-def test_fingers_bent_backwards_are_told_of(capsys: pytest.CaptureFixture[str]) -> None:
+def test_knuckles_out_of_their_range_are_told_of(capsys: pytest.CaptureFixture[str]) -> None:
     recording = Recording(HAND.markers, np.zeros((4, 9, 3)), np.arange(4) / 60, 60.0, source="")
     for degrees, told in ((-45, True), (10, False)):
         angles = np.zeros((4, len(ANGLES)))
@@ -214,10 +214,10 @@ def test_fingers_bent_backwards_are_told_of(capsys: pytest.CaptureFixture[str]) 
         recording = replace(recording, status=nothing, expected_error=nothing)
         notice = nothing[:, 0].astype(int)
         result = Tracked(replace(recording, angles=angles), nothing[:, 0], notice)
-        assert ("bent backwards" in _summary(result, None)) == told
+        assert ("out of their range" in _summary(result, None)) == told
     never = replace(recording, angles=np.full((4, len(ANGLES)), np.nan))
     lost = nothing[:, 0] + TrackingState.LOST
-    assert "bent" not in _summary(replace(result, recording=never, state=lost), None)
+    assert "out of their range" not in _summary(replace(result, recording=never, state=lost), None)
     assert "no joint angles" in _summary(replace(result, recording=recording), None)
 
 
