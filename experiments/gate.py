@@ -19,10 +19,11 @@ import numpy as np
 
 from jaxhand import datasets
 from jaxhand.sequences import RATE, Dataset
-from numpy_infer import gate, tracker
+from numpy_infer import tracker
 from numpy_infer.arrays import Array
 from numpy_infer.model import Model, load
 from numpy_infer.pose import Status
+from numpy_infer.reach import reach
 
 LEVELS = (0.0, 0.001, 0.003, 0.01, 0.03)
 """Parts of all marker time."""
@@ -85,7 +86,7 @@ def faults(spec: str, split: datasets.Split, seeds: int, look: Path | None) -> N
     """Prints what the gate makes of injected faults."""
     data = datasets.load(spec, split)
     model = load(data.hand.name)
-    pairs = gate.reach(model.hand).neighbours
+    pairs = reach(model.hand).neighbours
     kinds = "".join(f"{kind:>10}" for kind in SECONDS)
     print(
         f"{'wrong':>7}{'error, mm':>11}{'with gate':>11}{'repaired':>10}{'broken':>8}"

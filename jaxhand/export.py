@@ -23,7 +23,7 @@ FADES = (0.01, 0.02, 0.03, 0.04, 0.06, 0.1)
 SHARES = (0.0, 0.25, 0.5, 0.75, 0.85, 0.9, 0.95, 1.0)
 """Parts of the way from the network that was refined to what it became, that are tried on
 validation (Wortsman et al. 2022, Robust fine-tuning of zero-shot models): weights somewhat short of
-the end are better for people that were not in the data."""
+the end may be better for people that were not in the data."""
 
 PARITY = 1e-4
 """Largest difference between JAX and numpy outputs, relative to the spread of the outputs: what
@@ -43,8 +43,8 @@ def finish(
         model: as trained.
         sequences: of validation.
         report: is told what was chosen.
-        start: the model that the training went on from; how much of what it learned is kept is
-            then chosen first.
+        start: the model that the training went on from, whose scaling it has; how much of what it
+            learned is kept is then chosen first.
     """
     if model.marker_network is None:
         return model

@@ -47,11 +47,10 @@ from numpy_infer.gate import (
     SWAP_OFF,
     VOTES,
     GateState,
-    Reach,
-    reach,
 )
 from numpy_infer.model import Model
 from numpy_infer.pose import DETERMINED_EXTENT
+from numpy_infer.reach import Reach, reach
 
 
 def init(model: Model, batch: tuple[int, ...] = ()) -> GateState:

@@ -99,7 +99,7 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
             hand, seen, said = model.hand.resized(size.factor), size.seen, _of_size(size)
             if other.off < OTHER_SIDE * size.off:
                 side, off = "left" if _is_right(config) else "right", 1e3 * other.off
-                change = "leave out --right" if config.right else "see --right, --right-prefix"
+                change = "no --right, or --left-prefix" if _is_right(config) else "see --right"
                 said.append(f"as a {side} hand they fit better, within {off:.1f} mm: {change}")
     unseen = tuple(finger for finger, known in zip(FINGERS, seen, strict=True) if not known)
     flat = None if held is None else _flat(worn_by(model, hand), markers[held])

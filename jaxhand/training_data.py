@@ -61,13 +61,11 @@ def collect(config: TrainingConfig) -> Given:
         weight = sum(spec.weight for spec in specs if spec.name == SIMULATED)
         simulated, measured = weight * len(made[0].markers), _weight(training, recorded)
         training = training._replace(simulated=simulated / (simulated + measured))
-    joint_frames, notes = (
-        None,
-        [
-            f"{own.name}: {_takes(own)} to train, {_takes(other)} to validate"
-            for own, other in zip(recorded, held_out, strict=True)
-        ],
-    )
+    notes = [
+        f"{own.name}: {_takes(own)} to train, {_takes(other)} to validate"
+        for own, other in zip(recorded, held_out, strict=True)
+    ]
+    joint_frames = None
     if config.joints and (training.angles is None or validation.angles is None):
         joint_frames = made if start is None or start.joint_network is None else None
         does = "stays as it is" if joint_frames is None else f"learns simulated {hand.name} hands"

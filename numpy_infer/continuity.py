@@ -340,14 +340,20 @@ def _fill(
     """
     chosen = PREDICTORS[model.predictor]
     if chosen.of_frame is not None:
-        if np.count_nonzero(visible) < visible.size:
-            said = chosen.of_frame(model, registered, visible)
-            registered = np.where(visible[..., None], registered, said)
-        return predictor, registered, markers, visible
+        return predictor, filled(model, registered, visible), markers, visible
     if chosen.uses_frame:
         last = transform(*registration, untransform(*before, last))
     advance, raw = chosen.step(model, predictor, markers, visible, last, dt)
     return advance, untransform(*registration, raw), raw, np.ones_like(visible)
+
+
+def filled(model: Model, registered: Array, visible: Array) -> Array:
+    """`[..., M, 3]` registered frame: the markers, and what a predictor that looks at one frame
+    alone says of those that are hidden."""
+    of_frame = PREDICTORS[model.predictor].of_frame
+    if of_frame is None or every(visible):
+        return registered
+    return np.where(visible[..., None], registered, of_frame(model, registered, visible))
 
 
 def _registration_before(

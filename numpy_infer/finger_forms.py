@@ -60,16 +60,16 @@ _SIGNED_CROSS = np.stack(
     1,
 )
 _SIGNED_SQUARED = _SIGNED_CROSS @ _SIGNED_CROSS
-WAVES = np.stack([np.eye(3) + _SIGNED_SQUARED, -_SIGNED_SQUARED, _SIGNED_CROSS], 3)
+_WAVES = np.stack([np.eye(3) + _SIGNED_SQUARED, -_SIGNED_SQUARED, _SIGNED_CROSS], 3)
 """`[5, 2, 3, 3, 3, 3]` of the angles at each finger's base, and beyond it: what 1, cosine and sine
 of the angle are worth in its rotation."""
 
 FINGER_ANGLES = np.stack([BASE_ANGLES, OUTER_ANGLES], 1)
 """`[5, 2, 3]` of each finger those of its base, and those beyond."""
-BEYOND = np.array(CHAINS)[:, 1:]
+_BEYOND = np.array(CHAINS)[:, 1:]
 """`[5, 3]` the points of each finger after its base."""
 _TURN = "fiab,fjbc,fkcd->fijkad"
-BASE_FORM = np.einsum(_TURN, *np.moveaxis(WAVES[:, 0], 1, 0)).reshape(5, 27, 9)
+BASE_FORM = np.einsum(_TURN, *np.moveaxis(_WAVES[:, 0], 1, 0)).reshape(5, 27, 9)
 """The rotation of a finger's base, linear in such products of its angles."""
 
 
@@ -84,14 +84,14 @@ class FingerForms(NamedTuple):
     """`[5, 9, 3]` m²: the square of that marker's distance from the base."""
 
 
-_FIRST, _SIDE, _LAST = np.moveaxis(WAVES[:, 1], 1, 0)
+_FIRST, _SIDE, _LAST = np.moveaxis(_WAVES[:, 1], 1, 0)
 _MIDDLE = np.einsum("fiab,fjbc->fijac", _FIRST, _SIDE)
 _OUTER = np.einsum(_TURN, _FIRST, _SIDE, _LAST)
 
 
 def finger_forms(hand: Hand, xp: Any = np) -> FingerForms:
     """The forms of a hand's bones and markers; `xp` is numpy, or `jax.numpy` for traced ones."""
-    arms = end_arms(hand, xp)
+    arms = _end_arms(hand, xp)
     # Of 1, cosine and sine: 1 alone.
     one, middle, outer, last = (
         xp.asarray(part, arms.dtype) for part in (np.eye(3)[0], _MIDDLE, _OUTER, _LAST)
@@ -103,7 +103,7 @@ def finger_forms(hand: Hand, xp: Any = np) -> FingerForms:
         between = xp.einsum("fijac,fc,k->fijka", middle, parts[:, 1], one)
         return near + between + xp.einsum("fijkad,fd->fijka", outer, parts[:, 2])
 
-    bones = xp.asarray(hand.skeleton)[BEYOND]
+    bones = xp.asarray(hand.skeleton)[_BEYOND]
     points = [point(xp.where(np.arange(3)[:, None] <= n, bones, 0)) for n in range(3)]
     turns = xp.einsum("fijac,k->fijkac", middle, one), outer
     columns = [xp.stack(points, -1), *turns, point(arms)[..., None]]
@@ -118,7 +118,7 @@ def finger_forms(hand: Hand, xp: Any = np) -> FingerForms:
     return FingerForms(beyond, square.reshape(5, 9, 3))
 
 
-def end_arms(hand: Hand, xp: Any = np) -> Array:
+def _end_arms(hand: Hand, xp: Any = np) -> Array:
     """`[5, 3, 3]` metres: the way from each finger's base to its outermost marker, in the three
     parts that its joints carry, from the base out; 0 where it has none. `xp` as above."""
     ends, has = hand.end_markers
@@ -127,7 +127,7 @@ def end_arms(hand: Hand, xp: Any = np) -> Array:
     between = (np.array(CHAINS) == joints).argmax(-1)[:, None] > level
     skeleton, offsets = xp.asarray(hand.skeleton), xp.asarray(hand.offsets)
     carries = has[:, None] > 0
-    bones = xp.where((carries & between)[..., None], skeleton[BEYOND], 0)
+    bones = xp.where((carries & between)[..., None], skeleton[_BEYOND], 0)
     own = (carries & ((links - 1) % 3 == level))[..., None]
     return bones + xp.where(own, offsets[ends, None].astype(skeleton.dtype), 0)
 

@@ -27,11 +27,10 @@ import numpy as np
 
 from numpy_infer.arrays import Array, every
 from numpy_infer.geometry import kabsch, mean_point, second_extent, squares, transform
-from numpy_infer.hand import ANGLES, HIGH, JOINTS, LOW, PARENTS, Hand
 from numpy_infer.model import Model
 from numpy_infer.output import leading
 from numpy_infer.pose import DETERMINED_EXTENT
-from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
+from numpy_infer.reach import Reach, distances, reach
 
 QUIET = 5e-3
 """Metres that a marker of a quiet frame is off its uniform motion at most."""
@@ -71,11 +70,6 @@ ROBUST_SCALE, ROBUST_ROUNDS = 8e-3, 3
 VOTES = 4
 """To which power goes the part of the markers that keep their distance from one."""
 
-POSTURES = 2000
-"""Postures out of which `reach` takes distances."""
-NEARER, FARTHER, SLACK = 0.75, 1.25, 0.01
-"""Factors, and metres, by which other people's distances and other gloves' may differ."""
-
 BRIEFEST = 1e-4
 """Seconds: a shorter frame tells no velocity."""
 
@@ -107,56 +101,6 @@ class GateState(NamedTuple):
     was followed in the previous frame; else 0."""
     restless: Array
     """`[...]` metres: how far markers of late were off what was expected of them."""
-
-
-class Reach(NamedTuple):
-    """What a hand can do, as tables."""
-
-    nearest: Array
-    """`[M, M]` metres: the least distance of two markers."""
-    farthest: Array
-    """`[M, M]` metres: the largest."""
-    carriers: Array
-    """`[M, M]` True where the second marker is on what carries the first: the same link, or one
-    between it and the wrist; False for a marker itself."""
-    neighbours: Array
-    """`[P, 2]` markers that may be taken for each other: the outermost ones of fingers side by
-    side."""
-    partner: Array
-    """`[P, M]` each marker's own index, the other's for the two of a pair."""
-
-
-@lru_cache(maxsize=16)
-def reach(hand: Hand) -> Reach:
-    """The tables of a hand, from random postures within the ranges of its joints."""
-    angles = np.random.default_rng(0).uniform(LOW, HIGH, (POSTURES, len(ANGLES)))
-    eye = np.broadcast_to(np.eye(3), (POSTURES, 3, 3))
-    local = rotations_from_angles(angles)
-    placed = forward_kinematics(hand.skeleton, local, eye, np.zeros((POSTURES, 3)))
-    points = marker_positions(hand, *placed)
-    apart = _distances(points)
-    chains = [_chain(link) for link in hand.links]
-    carriers = np.array([[link in chain for link in hand.links] for chain in chains])
-    ends = np.stack([hand.end_markers[0][:-1], hand.end_markers[0][1:]], -1)
-    pairs = ends[(ends >= 0).all(-1)]
-    partner = np.tile(np.arange(len(hand)), (len(pairs), 1))
-    for own, (one, other) in zip(partner, pairs, strict=True):
-        own[[one, other]] = other, one
-    return Reach(
-        nearest=np.maximum(NEARER * apart.min(0) - SLACK, 0),
-        farthest=FARTHER * apart.max(0) + SLACK,
-        carriers=carriers & ~np.eye(len(hand), dtype=bool),
-        neighbours=pairs,
-        partner=partner,
-    )
-
-
-def _chain(link: int) -> list[int]:
-    """The joints from a link to the wrist, both included."""
-    chain = [link]
-    while PARENTS[chain[-1]] >= 0:
-        chain.append(PARENTS[chain[-1]])
-    return [joint for joint in chain if joint < len(JOINTS)]
 
 
 def init(model: Model, batch: tuple[int, ...] = ()) -> GateState:
@@ -432,7 +376,7 @@ def _motion(places: Array, markers: Array, fresh: Array) -> tuple[Array, Array]:
     # A marker's first say is by how many keep their distance from it: large errors would turn the
     # hand of a plain fit.
     both = use[..., :, None] * use[..., None, :]
-    earlier, now = _distances(places) * both, _distances(markers) * both
+    earlier, now = distances(places) * both, distances(markers) * both
     change = earlier - now
     votes = (use[..., None, :] / (1 + np.minimum(change * change, 1) / ROBUST_SCALE**2)).sum(-1)
     # Sizes that are no hand's would overflow in float32.
@@ -444,12 +388,6 @@ def _motion(places: Array, markers: Array, fresh: Array) -> tuple[Array, Array]:
         far = np.minimum((off * off).sum(-1), 1) / ROBUST_SCALE**2
         motion = kabsch(places, markers, use / (1 + far) ** 2, eye)
     return motion
-
-
-def _distances(points: Array) -> Array:
-    """`[..., M, M]` metres, of all to all."""
-    apart = points[..., :, None, :] - points[..., None, :, :]
-    return np.sqrt((apart * apart).sum(-1))
 
 
 def _least(off: Array) -> Array:
@@ -488,7 +426,7 @@ def _frozen(known: Reach, state: GateState, markers: Array, visible: Array) -> t
 def _impossible(known: Reach, markers: Array, candidates: Array) -> Array:
     """`[..., M]` True where a marker is too far from or too near to most of the other candidates
     for a hand."""
-    apart = _distances(markers)
+    apart = distances(markers)
     far = apart > known.farthest.astype(markers.dtype)
     near = apart < known.nearest.astype(markers.dtype)
     pair = candidates[..., :, None] & candidates[..., None, :]

@@ -21,12 +21,12 @@ from numpy_infer.continuity import (
     blended,
     choose,
     each,
+    filled,
     posture_change,
 )
 from numpy_infer.geometry import PRIOR_STRENGTH, fit, kabsch, pattern, transform, untransform
 from numpy_infer.model import Model
 from numpy_infer.pose import State
-from numpy_infer.predictors import PREDICTORS
 from numpy_infer.sight import parts_of
 
 
@@ -45,7 +45,7 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         return None
     rotation, translation = registration
     registered = untransform(rotation, translation, markers)
-    registered = _filled(model, registered, visible)
+    registered = filled(model, registered, visible)
     state = each(lambda leaf: leaf[None], state)
     frames = Frame(
         state.predictor,
@@ -82,14 +82,6 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         )
     state = state._replace(known=state.known | np.logical_or.accumulate(visible, 0))
     return blended(model, state, frames, markers, visible, weight, elapsed)
-
-
-def _filled(model: Model, registered: Array, visible: Array) -> Array:
-    """Markers `[..., M, 3]` of the registered frame, with what is said of those that are hidden."""
-    of_frame = PREDICTORS[model.predictor].of_frame
-    if of_frame is None or visible.all():
-        return registered
-    return np.where(visible[..., None], registered, of_frame(model, registered, visible))
 
 
 class _Changes(NamedTuple):
@@ -131,7 +123,7 @@ def _changes(
     template = model.hand.template.astype(markers.dtype, copy=False)
     then = kabsch(template, previous, seen.astype(markers.dtype), followed)
     anchor = untransform(*then, previous)
-    again = _filled(model, anchor, seen)
+    again = filled(model, anchor, seen)
     now = frames.rotation[at], frames.translation[at]
     origin = untransform(*now, transform(turn, move, translation[..., None, :]))
     back = now[0].swapaxes(-1, -2)

@@ -277,9 +277,11 @@ _WITH_BASE_ANGLES[BASE_ANGLES] = len(ANGLES) + np.arange(15).reshape(5, 3)
 _PLACED = 12 + np.arange(5 * 3 * 13).reshape(5, 3, 13)
 """Places, behind the wrist's own and its rotation, of what `place_fingers` makes of
 `FingerWaves.beyond`."""
-_ROTATIONS = 3 + np.arange(9).reshape(1, 3, 3)
 _ROTATIONS = np.concatenate(
-    [_ROTATIONS, _PLACED[..., :9].reshape(5, 3, 3, 3).swapaxes(1, 2).reshape(15, 3, 3)]
+    [
+        3 + np.arange(9).reshape(1, 3, 3),
+        _PLACED[..., :9].reshape(5, 3, 3, 3).swapaxes(1, 2).reshape(15, 3, 3),
+    ]
 )
 """`[16, 3, 3]`, and of points `[21, 3]`, in the world but for the wrist's position."""
 _POINTS = np.concatenate(

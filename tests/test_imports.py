@@ -32,8 +32,8 @@ ONE_SIDED = {
     # An IMU glove's rotations are no angles; the runtime has its fingers from angles.
     "skeleton": {"align_fingers"},
     # For many frames at once, in `offline`: JAX scans over them.
-    "continuity": {"blend", "blended", "each", "posture_change"},
-    "gate": {"ahead", "reach"},  # and a table that both sides share
+    "continuity": {"blend", "blended", "each", "filled", "posture_change"},
+    "gate": {"ahead"},
     # The spec and its file format exist once, in numpy; the flax module only beside JAX.
     "networks": {
         *("array_shapes", "read_spec", "write_spec"),
