@@ -116,7 +116,7 @@ def check(found: Any) -> None:
 def fingerprint(model: Model) -> str:
     """Of every field that a file holds, bit for bit."""
     plain = [model.hand.to_json(), model.predictor, model.joints, model.fade, model.continuity]
-    plain.append(model.faded_error)
+    plain.extend(getattr(model, name) for name in models.ERROR_NUMBERS)
     digest = hashlib.sha256(json.dumps([*plain, dict(model.training)], sort_keys=True).encode())
     arrays = {"expected_error": np.asarray(model.expected_error), "factors": model.error_factors}
     for name in ("marker_network", "joint_network"):

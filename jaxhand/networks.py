@@ -10,7 +10,7 @@ from flax import nnx
 
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
-from numpy_infer.model import Model
+from numpy_infer.model import ERROR_NUMBERS, Model
 from numpy_infer.networks import Dense, Dropout, Network, Spec
 
 for _kind, _data, _meta in (
@@ -24,7 +24,7 @@ for _kind, _data, _meta in (
         Model,
         (
             *("hand", "wearer", "flat", "marker_network", "joint_network", "fade"),
-            *("expected_error", "marker_error", "faded_error"),
+            *("expected_error", "marker_error", *ERROR_NUMBERS),
         ),
         ("predictor", "joints", "alignment", "gate", "smoothing", "continuity"),
     ),

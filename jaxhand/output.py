@@ -60,7 +60,8 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
 
 def _expected_error(model: Model, state: State) -> Array:
     """`[..., M]` metres: the marker's share of the model's table by number hidden and change of
-    posture, and what its correction has lost; of a visible one what is left of its way back."""
+    posture, and what its correction has lost, both bent to where no marker is off further; of a
+    visible one what is left of its way back."""
     dtype = state.drift.dtype
     table = jnp.asarray(model.expected_error, dtype)
     hidden = (~state.visible).sum(-1)
@@ -73,7 +74,9 @@ def _expected_error(model: Model, state: State) -> Array:
     faded = model.faded_error * (1 - jnp.exp(-state.change / model.fade))
     length = jnp.sqrt((state.correction * state.correction).sum(-1))
     returning = length if model.continuity else 0
-    return jnp.where(state.visible, returning, off + faded[..., None] * length)
+    off = off + faded[..., None] * length
+    error = model.least_error + off / (1 + model.error_saturation * off)
+    return jnp.where(state.visible, returning, error)
 
 
 def _to_side(pose: HandPose, right: Array) -> HandPose:

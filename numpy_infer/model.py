@@ -42,6 +42,9 @@ ERROR_CHANGES = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016)
 """Metres: changes of posture, RMS of the visible markers, at which `Model.expected_error` stands;
 between them it is linear."""
 
+ERROR_NUMBERS = ("faded_error", "error_saturation", "least_error")
+"""Fields of `Model` that say, beside its tables, what error to expect."""
+
 _APART = 2 * ERROR_CHANGES[-1]
 """Metres from row to row where they stand one behind the other."""
 
@@ -92,6 +95,11 @@ class Model:
     faded_error: float = 0.0
     """Metres of error to expect for each metre by which the marker's correction has faded: its
     length is what the predictor was off when the marker was lost."""
+    error_saturation: float = 0.0
+    """Per metre: where the two together say x, x / (1 + saturation · x) is expected, for nothing is
+    off by more than a finger is long."""
+    least_error: float = 0.0
+    """Metres to expect beside that of every hidden marker: the noise of the data."""
     training: Mapping[str, Any] = field(default_factory=dict)
     """Plain data about how the model was made and measured."""
 
@@ -132,8 +140,10 @@ class Model:
             raise ValueError(f"unknown joint stage {self.joints!r}: expected 'learned' or 'none'")
         if isinstance(self.fade, int | float) and not 0 < self.fade < inf:
             raise ValueError(f"'fade' must be positive metres, found {self.fade}")
-        if isinstance(self.faded_error, int | float) and not 0 <= self.faded_error < inf:
-            raise ValueError(f"'faded_error' must not be negative, found {self.faded_error}")
+        for name in ERROR_NUMBERS:
+            value = getattr(self, name)
+            if isinstance(value, int | float) and not 0 <= value < inf:
+                raise ValueError(f"{name!r} must be finite and not negative, found {value}")
         if isinstance(self.expected_error, np.ndarray):
             _check_errors(self.expected_error, self.error_factors, len(self.hand))
         inputs = 3 * len(self.hand)
@@ -177,7 +187,7 @@ def save(model: Model, path: str | Path, *, overwrite: bool = False) -> None:
         "joints": model.joints,
         "networks": networks,
         "fade": float(model.fade),
-        "faded_error": float(model.faded_error),
+        **{name: float(getattr(model, name)) for name in ERROR_NUMBERS},
         "continuity": bool(model.continuity),
         "training": dict(model.training),
     }
@@ -280,7 +290,7 @@ def _read(archive: zipfile.ZipFile) -> Model:
             f"written in version {header.get('version')!r}, this program reads version {VERSION}"
         )
     expected = {"format", "version", "hand", "predictor", "joints", "networks", "fade"}
-    expected |= {"faded_error", "continuity", "training", "checksum"}
+    expected |= {*ERROR_NUMBERS, "continuity", "training", "checksum"}
     if set(header) != expected or not isinstance(header["networks"], dict):
         raise ValueError(f"damaged header: expected {sorted(expected)}, found {sorted(header)}")
     for name in sorted(set(header["networks"]) - {"marker_network", "joint_network"}):
@@ -319,15 +329,15 @@ def _read(archive: zipfile.ZipFile) -> Model:
         continuity=header["continuity"],
         expected_error=arrays["expected_error"],
         marker_error=arrays["marker_error"],
-        faded_error=header["faded_error"],
         training=header["training"],
+        **{name: header[name] for name in ERROR_NUMBERS},
         **networks,
     )
 
 
 def _check_header(header: Mapping[str, Any]) -> None:
     kinds: dict[str, type] = {"predictor": str, "joints": str, "fade": float, "training": dict}
-    kinds |= {"faded_error": float, "continuity": bool}
+    kinds |= {"continuity": bool, **dict.fromkeys(ERROR_NUMBERS, float)}
     for key, kind in kinds.items():
         if not isinstance(header[key], kind):
             raise ValueError(f"header: expected {key!r} as {kind.__name__}, found {header[key]!r}")

@@ -81,7 +81,8 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
 
 def _expected_error(model: Model, state: State) -> Array:
     """`[..., M]` metres: the marker's share of the model's table by number hidden and change of
-    posture, and what its correction has lost; of a visible one what is left of its way back."""
+    posture, and what its correction has lost, both bent to where no marker is off further; of a
+    visible one what is left of its way back."""
     hidden, dtype = ~state.visible, state.drift.dtype
     some_hidden = np.count_nonzero(hidden)
     if not (some_hidden or np.count_nonzero(state.correction)):
@@ -96,6 +97,7 @@ def _expected_error(model: Model, state: State) -> Array:
     if model.faded_error:
         faded = model.faded_error * (1 - np.exp(-state.change / model.fade))
         error += faded[..., None] * length
+    error = model.least_error + error / (1 + model.error_saturation * error)
     return np.where(hidden, error, returning).astype(dtype, copy=False)
 
 

@@ -74,6 +74,15 @@ def x64(on: bool = True) -> Iterator[None]:
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def few_streams() -> Iterator[None]:
+    """What error to expect is measured in a sixteenth of the gaps: quicker, and coarser."""
+    with pytest.MonkeyPatch.context() as patched:
+        if jax is not None:
+            patched.setattr("jaxhand.expected_error.STREAMS", 256)
+        yield
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """With `pytest -n 2` a file is one worker's: what its tests share is made once."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from streams import a_model
 
-from numpy_infer.model import Model
+from numpy_infer.model import ERROR_NUMBERS, Model
 from numpy_infer.networks import Network
 
 Array = np.ndarray
@@ -28,6 +28,8 @@ def whole_model() -> Model:
         expected_error=table,
         marker_error=np.linspace(0.1, 2, 9),
         faded_error=0.2 + 0.1,
+        error_saturation=17.3,
+        least_error=1 / 1300,
         training={"data": ["a", "b"], "loss": 1 / 3, "seed": 0, "note": "Knöchel", "none": None},
     )
 
@@ -36,7 +38,7 @@ def assert_same(one: Model, other: Model) -> None:
     """Every field, bit for bit."""
     assert one.hand.to_json() == other.hand.to_json()
     assert one.hand.template.tobytes() == other.hand.template.tobytes()
-    for field in ("predictor", "joints", "fade", "faded_error", "continuity", "training"):
+    for field in ("predictor", "joints", "fade", *ERROR_NUMBERS, "continuity", "training"):
         assert getattr(one, field) == getattr(other, field)
         assert type(getattr(one, field)) is type(getattr(other, field))
     for name in ("marker_network", "joint_network"):

@@ -123,8 +123,9 @@ def test_what_could_not_be_read_back_is_not_written(
         ({"marker_error": np.ones(8)}, "marker_error"),
         ({"marker_error": np.full(9, np.nan)}, "marker_error"),
         ({"marker_error": np.full(9, -1.0)}, "marker_error"),
-        ({"faded_error": -0.5}, "'faded_error' must not be negative"),
-        ({"faded_error": float("inf")}, "'faded_error' must not be negative"),
+        ({"faded_error": -0.5}, "'faded_error' must be finite and not negative"),
+        ({"error_saturation": float("inf")}, "'error_saturation' must be finite and not negative"),
+        ({"least_error": float("nan")}, "'least_error' must be finite and not negative"),
     ],
 )
 def test_what_a_live_frame_would_fail_on_is_refused_when_the_model_is_made(
