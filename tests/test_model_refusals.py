@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from model_files import array_of, assert_same, unpack, whole_model
+from model_files import array_of, assert_same, unpack
 from numpy.lib.format import write_array_header_1_0
 from streams import a_model
 
@@ -23,17 +23,6 @@ from numpy_infer.model import Model, load, save
 from numpy_infer.networks import Dense
 
 Array = np.ndarray
-
-
-@pytest.fixture
-def model() -> Model:
-    return whole_model()
-
-
-@pytest.fixture
-def path(model: Model, tmp_path: Path) -> Path:
-    save(model, tmp_path / "model.npz")
-    return tmp_path / "model.npz"
 
 
 # -- refusals: a file taken apart, changed and put together again --------------------------------
