@@ -130,7 +130,10 @@ def load(
     """
     spec = parse_spec(spec) if isinstance(spec, str) else spec
     if spec.name not in SOURCES:
-        raise ValueError(f"no data set {spec.name!r}: expected one of {', '.join(SOURCES)}")
+        raise ValueError(
+            f"no data set {spec.name!r}: expected one of {', '.join(SOURCES)}, or, to train on, "
+            f"{SIMULATED}"
+        )
     source = SOURCES[spec.name]
     if (unit is not None or left_handed) and spec.name != OWN:
         raise ValueError(f"unit and left_handed are for {OWN}: files of {spec.name} are known")

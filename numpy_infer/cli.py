@@ -263,6 +263,8 @@ def _doubts(recording: Recording) -> list[str]:
 
 
 def _track(options: argparse.Namespace) -> None:
+    if options.smooth is not None and not 0 < options.smooth < np.inf:
+        raise ValueError(f"--smooth: expected a cutoff above 0 Hz, got {options.smooth:g}")
     outputs = _outputs(options)
     for output in outputs.values():
         writer_of(output)

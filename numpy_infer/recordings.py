@@ -7,9 +7,8 @@ handedness and each format's way of writing a gap end here, at the file's edge.
 from __future__ import annotations
 
 import importlib
-import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -217,8 +216,6 @@ def load_label_map(path: str | os.PathLike[str]) -> dict[str, str]:
     path = Path(path)
     try:
         mapping = read_json(path)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None
     except ValueError as error:
         raise refusal(path, error) from None
     if not isinstance(mapping, dict):
@@ -296,7 +293,8 @@ def _csv_format(path: Path) -> str:
 def _relabelled(recording: Recording, label_map: Mapping[str, str]) -> Recording:
     """Our names for mapped labels; the others without their `Subject:` prefix."""
     bare = {label: _without_prefix(label) for label in recording.names}
-    _check_known(label_map, (*bare, *bare.values()), f"{recording.source}: label map: ")
+    there = dict.fromkeys((*bare, *bare.values()))
+    _check_known(label_map, there, f"{recording.source}: label map: ")
     names = {label: label_map.get(label, label_map.get(bare[label], bare[label])) for label in bare}
     by_name: dict[str, str] = {}
     for label, name in names.items():
@@ -324,7 +322,7 @@ def _check_unique(names: Sequence[str], what: str, where: str = "") -> None:
         seen.add(name)
 
 
-def _check_known(asked: Iterable[str], names: Sequence[str], where: str) -> None:
+def _check_known(asked: Iterable[str], names: Collection[str], where: str) -> None:
     known = set(names)
     missing = [name for name in asked if name not in known]
     if missing:

@@ -284,6 +284,15 @@ def test_too_few_labels_are_refused_with_what_is_lacking(
     assert "--left-prefix" in refused(["track", "left.csv", "-o", "out.csv"], capsys)
 
 
+@pytest.mark.parametrize("hertz", ["0", "-1", "nan", "inf"])
+def test_a_cutoff_that_is_none_is_refused_before_the_work(
+    hertz: str, take: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(numpy_infer.cli, "read", lambda *_, **__: pytest.fail("worked first"))
+    error = refused(["track", take, "-o", "out.csv", "--smooth", hertz], capsys)
+    assert error == f"jaxhand track: --smooth: expected a cutoff above 0 Hz, got {hertz}\n"
+
+
 @pytest.mark.parametrize(
     ("factor", "said"),
     [
