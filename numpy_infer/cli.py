@@ -30,6 +30,8 @@ STRAINED = 8.0
 """Degrees out of its range that an angle at a knuckle, or at the thumb's base, may be half of the
 time. Of 51 recordings of their own side, SIG18's users 1 to 3, none was more than 6 out, of the
 other side four were less; of 72 simulated hands none, and ten."""
+_BLANK = -1
+"""In place of a status: nothing was written."""
 _KNUCKLES = [i for i, a in enumerate(ANGLES) if a.joint.endswith(("cmc", "mcp"))]
 
 VERBS = {
@@ -338,16 +340,18 @@ def _without(hand: Hand, absent: Sequence[str], labels: Sequence[str], prefix: s
 
 def _summary(result: Tracked, doubt: str | None) -> str:
     """What is said of a hand that was tracked. doubt: what is wrong with its size."""
-    status, state = result.status, result.state
+    state, there = result.state, result.recording.visible
+    status = np.where(there, result.status, _BLANK)
     lines = [f"{len(state)} frames, {len(result.recording.names)} markers"]
     for name, text in (
         (Status.OBSERVED, "measured"),
         (Status.PREDICTED, "filled from what was seen in the frame"),
         (Status.HELD, "held: nothing in the frame determined them, or says how far off they are"),
         (Status.REJECTED, "measured at a wrong place, it seems, and filled (see --no-gate)"),
+        (_BLANK, "left blank: nothing fills them, or the hand had not been tracked yet"),
     ):
         share = 100 * (status == name).mean()
-        if share or name != Status.REJECTED:
+        if share or name == Status.OBSERVED:
             lines.append(f"{share:6.2f} % of the markers {text}")
     far = (result.notice & Notice.SUSPECTED_MILLIMETRES) > 0
     if doubt:
@@ -362,7 +366,7 @@ def _summary(result: Tracked, doubt: str | None) -> str:
     if hidden.any():
         error = 1e3 * result.expected_error[hidden].mean()
         lines.append(f"filled ones, seen before, are expected to be {error:.0f} mm off on average")
-    never = ~seen[-1] & result.recording.visible.any(0)
+    never = ~seen[-1] & there.any(0)
     if never.any():
         names = np.array(result.recording.names)[never]
         lines.append(f"never seen: {', '.join(names)}; filled all the same, centimetres off maybe")

@@ -252,8 +252,29 @@ def test_a_label_that_the_file_lacks_is_as_an_empty_column_and_told_of(
             used = f"labels not used: {HAND.markers[8]}? (--map renames)"
             assert (used in error) == (name == "misspelt.csv")
             assert error.count("\n") == 1
-    assert main(["track", "without.csv", "--predictor", "none", "-o", "o.csv"]) == 0
-    assert "never seen" not in capsys.readouterr().out, "nothing is filled"
+
+
+@pytest.mark.parametrize("predictor", ["none", "affine"])
+def test_what_is_left_blank_is_not_said_to_be_filled(
+    predictor: str, take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Never seen, hidden, at a wrong place; and, whatever fills, all before the first frame."""
+    recording = read(take).select(HAND.markers[:-1])
+    markers = recording.markers + 1e-3 * np.random.default_rng(0).normal(size=(30, 8, 3))
+    markers[:3] = markers[10:20, 3] = np.nan
+    markers[15:, 5] += 0.3
+    write(replace(recording, markers=markers), tmp_path / "gap.csv")
+    assert main(["track", "gap.csv", "--predictor", predictor, "-o", "out.csv"]) == 0
+    printed = capsys.readouterr().out
+    assert ("filled" in printed) == (predictor != "none")
+    told = [
+        line.split(" % of the markers ") for line in printed.splitlines() if "% of the m" in line
+    ]
+    shares = {text: float(share) for share, text in told}
+    seen = np.isfinite(read("out.csv").markers).all(-1)
+    assert sum(shares.values()) == pytest.approx(100, abs=0.05)
+    (blank,) = (share for text, share in shares.items() if text.startswith("left blank: "))
+    assert blank == pytest.approx(100 * (1 - seen.mean()), abs=0.01)
 
 
 def test_what_to_expect_is_said_of_markers_that_were_seen() -> None:
