@@ -14,6 +14,7 @@ from rich.console import Console
 from jaxhand.calibration import DENSE, Calibration, calibrate, new_hand
 from jaxhand.hand_size import ALIKE, SIZES, Size, hand_size
 from jaxhand.joint_evaluation import evaluate_poses
+from jaxhand.options import Unit
 from numpy_infer import wearer
 from numpy_infer.arrays import Array
 from numpy_infer.cli import check_output
@@ -49,8 +50,8 @@ class _File:
     """The same of a right hand."""
     map: Path | None = None
     """JSON file {"label in the file": "marker"}."""
-    unit: float | None = None
-    """Metres per unit, where the file does not say."""
+    unit: Unit = None
+    """The file's unit, where it does not say."""
     left_handed: bool = False
     """The file's coordinates are left-handed."""
     overwrite: bool = False

@@ -22,6 +22,7 @@ from jaxhand.anthropometry import people
 from jaxhand.cameras import Rig, film
 from jaxhand.compiled import compiled
 from jaxhand.datasets import SIMULATED
+from jaxhand.options import Unit
 from jaxhand.pictures import check_picture, occlusions_picture
 from jaxhand.two_hands import two_hands
 from numpy_infer.arrays import Array
@@ -285,8 +286,8 @@ class OcclusionsConfig:
     """The same of a right hand."""
     map: Path | None = None
     """JSON file {"label in the file": "marker"}."""
-    unit: float | None = None
-    """Metres per unit, where the file does not say."""
+    unit: Unit = None
+    """The file's unit, where it does not say."""
     left_handed: bool = False
     """The file's coordinates are left-handed."""
     json: Path | None = None

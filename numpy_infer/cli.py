@@ -16,6 +16,7 @@ import numpy as np
 
 from numpy_infer import wearer
 from numpy_infer.arrays import Array
+from numpy_infer.formats.units import metres
 from numpy_infer.hand import ANGLES, HIGH, LOW, POINTS, Hand, bundled, load_hand
 from numpy_infer.labels import doubted_unit, fitting_hand, labels_of, lacking, prefixed, unfitting
 from numpy_infer.model import Model, load
@@ -188,7 +189,11 @@ def check_output(path: Path, *, overwrite: bool) -> None:
 def _add_file(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("file", type=Path, help="TRC, Qualisys TSV, CSV, Motive CSV, BVH, C3D, …")
     verb.add_argument("--map", type=Path, help='JSON file {"label in the file": "marker"}')
-    verb.add_argument("--unit", type=float, help="metres per unit, where the file does not say")
+    verb.add_argument(
+        "--unit",
+        metavar="U",
+        help="the file's, where it does not say: mm, cm, m, in, or a number of metres",
+    )
     verb.add_argument(
         "--left-handed", action="store_true", help="the file's coordinates are left-handed"
     )
@@ -197,7 +202,7 @@ def _add_file(verb: argparse.ArgumentParser) -> None:
 def _read(options: argparse.Namespace) -> Recording:
     return read(
         options.file,
-        unit=options.unit,
+        unit=None if options.unit is None else metres(options.unit),
         left_handed=options.left_handed,
         label_map=load_label_map(options.map) if options.map else None,
     )

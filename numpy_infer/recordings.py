@@ -19,6 +19,7 @@ import numpy as np
 
 from numpy_infer.formats.json_text import read_json
 from numpy_infer.formats.refusal import refusal, shortened
+from numpy_infer.formats.units import LARGEST
 
 BUILT_IN = {
     name: f"numpy_infer.formats.{name}"
@@ -184,7 +185,7 @@ def read(
     half read. A file that is not there is the usual FileNotFoundError.
     """
     path = Path(path)
-    if unit is not None and not 0 < unit < 1e6:
+    if unit is not None and not 0 < unit < LARGEST:
         raise ValueError(f"unit: expected metres per file unit, got {unit}")
     reader = _reader(path, format)
     try:

@@ -339,6 +339,21 @@ def test_a_wrong_unit_is_told_of(
         assert "over a metre" not in printed, "the unit is reason enough"
 
 
+@pytest.mark.parametrize("verb", [["inspect"], ["track", "-o", "out.csv", "--overwrite"]])
+def test_a_unit_may_be_named(
+    verb: list[str], take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read(take)
+    write(replace(recording, markers=1e3 * recording.markers), tmp_path / "bare.csv")
+    text = Path("bare.csv").read_text()
+    Path("bare.csv").write_text(text.replace("# unit: m\n", ""))
+    assert "--unit mm" in refused([*verb, "bare.csv"], capsys)
+    assert "got 'furlong'" in refused([*verb, "bare.csv", "--unit", "furlong"], capsys)
+    for unit in ("mm", "0.001"):
+        assert main([*verb, "bare.csv", "--unit", unit]) == 0
+        assert "for a hand" not in capsys.readouterr().out
+
+
 def test_one_marker_far_away_is_no_matter_of_units(
     take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

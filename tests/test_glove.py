@@ -15,7 +15,7 @@ from fitted import fitted_model
 from rich.console import Console
 from simulated import motion, worn
 
-from jaxhand import cli, glove
+from jaxhand import cli, glove, occlusions, report
 from jaxhand.calibration import Calibration
 from jaxhand.datasets import SIG18_AS_GLOVE9
 from numpy_infer import HandTracker, load_hand, model, wearer
@@ -195,6 +195,25 @@ def test_a_mistake_is_one_clear_line_before_the_fit(
     assert message in error
     assert error.count("\n") == 1
     assert not (tmp_path / "me.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("config", "arguments"),
+    [
+        (glove.CalibrateConfig, ["a.csv", "-o", "b.json", "--model", "glove9"]),
+        (glove.HandConfig, ["a.csv", "-o", "b.json"]),
+        (occlusions.OcclusionsConfig, ["a.csv"]),
+        (report.EvaluationConfig, ["--data", "recordings:a"]),
+    ],
+)
+def test_a_unit_may_be_named(
+    config: type, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for given, unit in (([], None), (["--unit", "mm"], 1e-3), (["--unit", "0.5"], 0.5)):
+        assert cli._parsed(config, [*arguments, *given], "verb", "").unit == unit
+    with pytest.raises(SystemExit):
+        cli._parsed(config, [*arguments, "--unit", "furlong"], "verb", "")
+    assert "expected mm, cm" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("out", ["nodir/mine.json", "."])
