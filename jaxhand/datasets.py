@@ -38,6 +38,7 @@ from numpy_infer.hand import (
     Hand,
     load_hand,
 )
+from numpy_infer.labels import of_hand
 from numpy_infer.recordings import READER_OF, Recording, load_label_map, read
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
@@ -187,7 +188,7 @@ def _measured(
 
 
 def _sequence(recording: Recording, hand: Hand, take: str, side: str) -> Sequence:
-    markers = resample(recording.time, recording.select(hand.markers).markers)
+    markers = resample(recording.time, of_hand(recording, "", hand).markers)
     markers = (mirror(markers) if side == "right" else markers).astype(np.float32)
     return Sequence(f"{take}/{side}", take, RATE, markers)
 

@@ -20,7 +20,7 @@ from numpy_infer.arrays import Array
 from numpy_infer.cli import check_output
 from numpy_infer.geometry import mirror
 from numpy_infer.hand import FINGERS, POINTS, Hand, load_hand
-from numpy_infer.labels import doubted_unit, labels_of
+from numpy_infer.labels import doubted_unit, of_hand
 from numpy_infer.model import Model
 from numpy_infer.model import load as load_model
 from numpy_infer.recordings import Recording, load_label_map, read
@@ -157,8 +157,7 @@ def _read(config: _File) -> Recording:
 def _markers(recording: Recording, hand: Hand, config: _File) -> Array:
     """`[T, M, 3]` metres, of a canonical left hand, all of whose labels are there."""
     prefix = config.left_prefix or config.right_prefix
-    labels_of(recording, prefix)
-    own = recording.select([prefix + name for name in hand.markers])
+    own = of_hand(recording, prefix, hand)
     if doubt := doubted_unit(replace(own, names=hand.markers, filled=()), hand):
         raise ValueError(doubt)
     return mirror(own.markers) if _is_right(config) else own.markers

@@ -28,6 +28,7 @@ from jaxhand.two_hands import two_hands
 from numpy_infer.arrays import Array
 from numpy_infer.cli import check_output
 from numpy_infer.hand import Hand, bundled, load_hand
+from numpy_infer.labels import advice
 from numpy_infer.recordings import Recording, load_label_map, read
 
 QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
@@ -388,10 +389,11 @@ def hands_in(
         there = [own for own in sides if known >= set(own) or (name and known & set(own))]
         if there:
             return hand, [recording.select(own).visible for own in there]
-    raise ValueError(
+    text = (
         f"{recording.source}: no hand fits the labels {', '.join(recording.names)}: name one with "
         "--hand, its prefixes with --left-prefix and --right-prefix, or rename with --map"
     )
+    raise ValueError("; ".join([text, *advice(recording.names)]))
 
 
 def print_tables(tables: Mapping[str, Occlusions], console: Console) -> None:

@@ -18,7 +18,15 @@ from numpy_infer import wearer
 from numpy_infer.arrays import Array
 from numpy_infer.formats.units import metres
 from numpy_infer.hand import ANGLES, HIGH, LOW, POINTS, Hand, bundled, load_hand
-from numpy_infer.labels import doubted_unit, fitting_hand, labels_of, lacking, prefixed, unfitting
+from numpy_infer.labels import (
+    doubted_unit,
+    doubts,
+    fitting_hand,
+    labels_of,
+    prefixed,
+    unfitting,
+    without,
+)
 from numpy_infer.model import Model, load
 from numpy_infer.model import bundled as bundled_models
 from numpy_infer.one_euro import Smoothing
@@ -253,20 +261,13 @@ def describe(recording: Recording) -> dict[str, Any]:
         "seconds": float(recording.time[-1] - recording.time[0]),
         "rate": recording.rate,
         "unit_m": recording.unit,
-        "notes": [*recording.notes, *_doubts(recording)],
+        "notes": [*recording.notes, *doubts(recording)],
         "markers": markers,
         "hands": {
             name: [m for m in load_hand(name).markers if m not in recording.names]
             for name in bundled()
         },
     }
-
-
-def _doubts(recording: Recording) -> list[str]:
-    """What is wrong with the size of the hand that fits, if one does."""
-    hand = fitting_hand(recording.names)
-    doubt = doubted_unit(prefixed(recording, "", hand), hand) if hand else None
-    return [doubt] if doubt else []
 
 
 def _track(options: argparse.Namespace) -> None:
@@ -302,8 +303,8 @@ def _track(options: argparse.Namespace) -> None:
 
     hands = [prefixed(recording, prefixes[side], model.hand) for side in outputs]
     for side, own in zip(outputs, labels, strict=True):
-        if absent := lacking(model.hand, own):
-            print(_without(model.hand, absent, own, prefixes[side]), file=sys.stderr)
+        if told := without(model.hand, own, prefixes[side]):
+            print(f"jaxhand track: {told}", file=sys.stderr)
     if len(hands) == 1:
         results = [track(hands[0], model, right="right" in outputs, report=report)]
     else:
@@ -331,16 +332,6 @@ def _outputs(options: argparse.Namespace) -> dict[str, Path]:
     if options.right and options.left_prefix:
         raise ValueError("--right goes with --right-prefix, not with --left-prefix")
     return {"right" if options.right or options.right_prefix else "left": out}
-
-
-def _without(hand: Hand, absent: Sequence[str], labels: Sequence[str], prefix: str) -> str:
-    """What is said of labels that a file lacks, and which of those it has might be them."""
-    surplus = [prefix + label for label in labels if label not in hand.markers]
-    named = f"; labels not used: {', '.join(surplus)} (--map renames)" if surplus else ""
-    return (
-        f"jaxhand track: no label {', '.join(prefix + name for name in absent)}: tracked as never "
-        f"seen{named}"
-    )
 
 
 def _summary(result: Tracked, doubt: str | None) -> str:

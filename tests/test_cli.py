@@ -249,8 +249,9 @@ def test_a_label_that_the_file_lacks_is_as_an_empty_column_and_told_of(
             assert Path("out.csv").read_bytes() == Path("expected.csv").read_bytes()
             error = capsys.readouterr().err
             assert f"no label {HAND.markers[8]}: tracked as never seen" in error
-            used = f"labels not used: {HAND.markers[8]}? (--map renames)"
+            used = f"labels not used: {HAND.markers[8]}?; did you mean {HAND.markers[8]} by "
             assert (used in error) == (name == "misspelt.csv")
+            assert ("--map" in error) == (name == "misspelt.csv")
             assert error.count("\n") == 1
 
 
@@ -291,6 +292,38 @@ def test_what_to_expect_is_said_of_markers_that_were_seen() -> None:
     said = _summary(Tracked(made, np.zeros(4), np.zeros(4, int)), None)
     assert "filled ones, seen before, are expected to be 5 mm off" in said
     assert f"never seen: {', '.join(HAND.markers[3:])}; filled" in said
+
+
+def test_a_label_that_is_nearly_a_markers_name_is_asked_about(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = "did you mean index_tip by index_tp? (--map renames)"
+    write(read(take).rename({"index_tip": "index_tp"}), tmp_path / "tp.csv")
+    assert main(["inspect", "tp.csv"]) == 0
+    assert f"note: {asked}\n" in capsys.readouterr().out
+    assert main(["track", "tp.csv", "-o", "out.csv"]) == 0
+    assert asked in capsys.readouterr().err
+    write(read(take).rename({name: name.title() for name in HAND.markers}), tmp_path / "all.csv")
+    pairs = ", ".join(f"{name} by {name.title()}" for name in HAND.markers)
+    for model in ([], ["--model", "glove9"]):
+        error = refused(["track", "all.csv", "-o", "out.csv", "--overwrite", *model], capsys)
+        assert f"; did you mean {pairs}? (--map renames)" in error
+
+
+def test_prefixes_of_two_hands_are_pointed_out(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [prefix + name for prefix in ("R_", "L_") for name in HAND.markers]
+    whole = read(take)
+    both = np.concatenate([whole.markers, 1000 * whole.markers], 1)
+    write(replace(whole, names=names, markers=both, filled=()), tmp_path / "both.csv")
+    begun = "labels of a hand begin with R_ and L_: see --right-prefix R_ --left-prefix L_"
+    assert main(["inspect", "both.csv"]) == 0
+    printed = capsys.readouterr().out
+    assert f"note: {begun}\n" in printed
+    assert "1000 times too large" in printed, "the left one is looked at, too"
+    assert begun in refused(["track", "both.csv", "-o", "out.csv"], capsys)
+    assert begun in refused(["track", "both.csv", "--model", "glove9", "-o", "out.csv"], capsys)
 
 
 def test_too_few_labels_are_refused_with_what_is_lacking(
