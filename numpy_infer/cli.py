@@ -305,6 +305,9 @@ def _track(options: argparse.Namespace) -> None:
     for side, own in zip(outputs, labels, strict=True):
         if told := without(model.hand, own, prefixes[side]):
             print(f"jaxhand track: {told}", file=sys.stderr)
+    for hand in hands:
+        if doubt := doubted_unit(hand, model.body):
+            raise ValueError(f"{options.file}: {doubt}")
     if len(hands) == 1:
         results = [track(hands[0], model, right="right" in outputs, report=report)]
     else:
@@ -314,13 +317,13 @@ def _track(options: argparse.Namespace) -> None:
         print(file=sys.stderr)
     if options.as_measured:
         results = [as_measured(result, hand) for result, hand in zip(results, hands, strict=True)]
-    for (side, output), hand, result in zip(outputs.items(), hands, results, strict=True):
+    for (side, output), result in zip(outputs.items(), results, strict=True):
         write(result.recording, output, overwrite=options.overwrite)
         if len(outputs) > 1:
             print(f"{side} hand")
         elif side == "left" and "right" in options.file.stem.lower():
             print("tracked as a left hand, though the file's name says right: see --right")
-        print(_summary(result, doubted_unit(hand, model.body)))
+        print(_summary(result))
         print(f"wrote {output}")
 
 
@@ -334,8 +337,8 @@ def _outputs(options: argparse.Namespace) -> dict[str, Path]:
     return {"right" if options.right or options.right_prefix else "left": out}
 
 
-def _summary(result: Tracked, doubt: str | None) -> str:
-    """What is said of a hand that was tracked. doubt: what is wrong with its size."""
+def _summary(result: Tracked) -> str:
+    """What is said of a hand that was tracked."""
     state, there = result.state, result.recording.visible
     status = np.where(there, result.status, _BLANK)
     lines = [f"{len(state)} frames, {len(result.recording.names)} markers"]
@@ -350,9 +353,7 @@ def _summary(result: Tracked, doubt: str | None) -> str:
         if share or name == Status.OBSERVED:
             lines.append(f"{share:6.2f} % of the markers {text}")
     far = (result.notice & Notice.SUSPECTED_MILLIMETRES) > 0
-    if doubt:
-        lines.append(doubt)
-    elif far.any():
+    if far.any():
         lines.append(
             f"{100 * far.mean():6.2f} % of the frames have a marker over a metre from the others"
         )

@@ -214,11 +214,11 @@ def test_knuckles_out_of_their_range_are_told_of(capsys: pytest.CaptureFixture[s
         recording = replace(recording, status=nothing, expected_error=nothing)
         notice = nothing[:, 0].astype(int)
         result = Tracked(replace(recording, angles=angles), nothing[:, 0], notice)
-        assert ("out of their range" in _summary(result, None)) == told
+        assert ("out of their range" in _summary(result)) == told
     never = replace(recording, angles=np.full((4, len(ANGLES)), np.nan))
     lost = nothing[:, 0] + TrackingState.LOST
-    assert "out of their range" not in _summary(replace(result, recording=never, state=lost), None)
-    assert "no joint angles" in _summary(replace(result, recording=recording), None)
+    assert "out of their range" not in _summary(replace(result, recording=never, state=lost))
+    assert "no joint angles" in _summary(replace(result, recording=recording))
 
 
 def test_a_name_that_says_right_is_heard(take: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -289,7 +289,7 @@ def test_what_to_expect_is_said_of_markers_that_were_seen() -> None:
     made = Recording(
         HAND.markers, markers, time, 60.0, source="", status=status, expected_error=off
     )
-    said = _summary(Tracked(made, np.zeros(4), np.zeros(4, int)), None)
+    said = _summary(Tracked(made, np.zeros(4), np.zeros(4, int)))
     assert "filled ones, seen before, are expected to be 5 mm off" in said
     assert f"never seen: {', '.join(HAND.markers[3:])}; filled" in said
 
@@ -355,7 +355,7 @@ def test_a_cutoff_that_is_none_is_refused_before_the_work(
         (1, ()),
     ],
 )
-def test_a_wrong_unit_is_told_of(
+def test_a_wrong_unit_is_told_of_and_not_tracked(
     factor: float,
     said: tuple[str, ...],
     take: str,
@@ -364,12 +364,15 @@ def test_a_wrong_unit_is_told_of(
 ) -> None:
     recording = read(take)
     write(replace(recording, markers=factor * recording.markers), tmp_path / "other.csv")
-    for arguments in (["inspect", "other.csv"], ["track", "other.csv", "-o", "out.csv"]):
-        assert main(arguments) == 0
-        printed = capsys.readouterr().out
+    assert main(["inspect", "other.csv"]) == 0
+    told = capsys.readouterr().out
+    assert main(["track", "other.csv", "-o", "out.csv"]) == (2 if said else 0)
+    refusal = capsys.readouterr().err
+    assert Path("out.csv").exists() == (not said), "nothing that may be taken for the hand"
+    for printed in (told, refusal):
         assert all(part in printed for part in said)
         assert ("for a hand" in printed) == bool(said)
-        assert "over a metre" not in printed, "the unit is reason enough"
+    assert refusal.count("\n") == bool(said)
 
 
 @pytest.mark.parametrize("verb", [["inspect"], ["track", "-o", "out.csv", "--overwrite"]])
