@@ -181,7 +181,7 @@ def _measured(
         label_map = load_label_map(labels) if labels.exists() else None
         recording = read(
             path, label_map=label_map, unit=reading.unit, left_handed=reading.left_handed
-        )
+        ).measured()
         take, named = _without_side(path.stem)
         sequences.append(_sequence(recording, hand, take, side or named))
     return Dataset("", hand, tuple(sequences))

@@ -151,7 +151,7 @@ def _read(config: _File) -> Recording:
         unit=config.unit,
         left_handed=config.left_handed,
         label_map=load_label_map(config.map) if config.map else None,
-    )
+    ).measured()
 
 
 def _markers(recording: Recording, hand: Hand, config: _File) -> Array:

@@ -359,7 +359,7 @@ def _recorded(config: OcclusionsConfig, console: Console) -> dict[str, Occlusion
     for file in config.files:
         recording = read(
             file, unit=config.unit, left_handed=config.left_handed, label_map=label_map
-        )
+        ).measured()
         hand, hands = hands_in(recording, config.hand, config.left_prefix, config.right_prefix)
         layouts.add((hand.markers, recording.rate))
         if len(layouts) > 1:

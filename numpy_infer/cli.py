@@ -213,7 +213,7 @@ def _read(options: argparse.Namespace) -> Recording:
         unit=None if options.unit is None else metres(options.unit),
         left_handed=options.left_handed,
         label_map=load_label_map(options.map) if options.map else None,
-    )
+    ).measured()
 
 
 def _inspect(options: argparse.Namespace) -> None:

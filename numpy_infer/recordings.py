@@ -82,7 +82,7 @@ class Recording:
     joints: joint truth, if the file has any.
     angles: [T, 26] radians, in the order of `hand.ANGLES`: what tracking made of the markers.
     wrist: [T, 7] of the wrist joint metres, and the quaternion xyzw of its rotation: likewise.
-    status: [T, M] a `pose.Status` each: what tracking says that a marker rests on.
+    status: [T, M] a `pose.Status` each: what tracking says that a marker rests on; NaN unknown.
     expected_error: [T, M] metres: how far off tracking expects it to be.
     filled: names whose values are partly made up, by the recording software or by tracking.
     notes: one-line things that the reader wants the user to know.
@@ -134,6 +134,23 @@ class Recording:
     def visible(self) -> np.ndarray:
         """[T, M] True where all three coordinates are finite."""
         return np.isfinite(self.markers).all(axis=-1)
+
+    def measured(self) -> Recording:
+        """What was measured alone: a marker that tracking filled is hidden, as `status` says."""
+        if self.status is None:
+            return self
+        made = self.visible & (self.status > 0)
+        note = f"{made.sum()} positions that tracking had filled (.status) are taken as gaps"
+        return replace(
+            self,
+            markers=np.where(made[..., None], np.nan, self.markers),
+            angles=None,
+            wrist=None,
+            status=None,
+            expected_error=None,
+            filled=tuple(name for name in self.filled if not made[:, self.names.index(name)].any()),
+            notes=(*self.notes, note) if made.any() else self.notes,
+        )
 
     def select(self, names: Sequence[str]) -> Recording:
         """The given markers only, in the given order; ValueError lists those that are missing."""

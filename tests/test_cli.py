@@ -195,6 +195,27 @@ def test_a_filled_table_says_what_was_measured_and_how_far_off_the_rest_may_be(
         )
 
 
+def test_what_was_filled_once_is_hidden_when_it_is_tracked_again(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read(take)
+    markers = recording.markers + 1e-3 * np.random.default_rng(0).normal(size=(30, 9, 3))
+    markers[10:20, 3] = markers[15:, 7] = markers[22:24] = np.nan
+    write(replace(recording, markers=markers), tmp_path / "0.csv")
+    for once, again in (("0", "1"), ("1", "2")):
+        assert main(["track", f"{once}.csv", "-o", f"{again}.csv", "--as-measured"]) == 0
+    assert Path("1.csv").read_bytes() == Path("2.csv").read_bytes()
+    capsys.readouterr()
+    gaps = []
+    for name in ("0.csv", "1.csv"):
+        assert main(["inspect", name, "--json"]) == 0
+        gaps.append(json.loads(capsys.readouterr().out))
+    assert gaps[0]["markers"] == gaps[1]["markers"]
+    hidden = np.isnan(markers).all(-1).sum()
+    note = f"{hidden} positions that tracking had filled (.status) are taken as gaps"
+    assert note in gaps[1]["notes"]
+
+
 def test_hands_say_where_their_markers_sit(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["hands"]) == 0
     lines = capsys.readouterr().out.splitlines()

@@ -179,6 +179,17 @@ def test_labels_beside_the_recordings_are_used(tmp_path: Path) -> None:
     assert load(f"recordings:{tmp_path / 'a.trc'}@3", "test").weight == 3
 
 
+def test_what_tracking_filled_is_no_recording_to_learn_from(tmp_path: Path) -> None:
+    glove = load_hand("glove9")
+    status = np.zeros((60, 9))
+    status[20:40, 3] = 1
+    markers = np.repeat(glove.template[None], 60, 0)
+    take = Recording(glove.markers, markers, np.arange(60) / 60, 60.0, "", status=status)
+    write(take, tmp_path / "a.csv")
+    (sequence,) = load(f"recordings:{tmp_path / 'a.csv'}", "test").sequences
+    np.testing.assert_array_equal(np.isnan(sequence.markers).all(-1), status > 0)
+
+
 def test_complete_frames_are_those_with_every_marker() -> None:
     markers = np.random.default_rng(0).normal(size=(5, 9, 3)).astype(np.float32)
     holed = markers.copy()

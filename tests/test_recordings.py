@@ -113,6 +113,14 @@ def test_what_tracking_says_is_written_beside_the_markers(
     np.testing.assert_array_equal(got.time, recording.time)
     made_up = (recording.visible & (status > 0)).any(0)
     assert got.filled == tuple(np.array(recording.names)[made_up])
+    np.testing.assert_array_equal(got.status, np.where(recording.visible, status, np.nan))
+    measured = got.measured()
+    np.testing.assert_array_equal(measured.visible, recording.visible & (status == 0))
+    np.testing.assert_array_equal(
+        measured.markers, np.where(measured.visible[..., None], recording.markers, np.nan)
+    )
+    assert (measured.status, measured.filled) == (None, ())
+    assert recording.measured() is recording
     lines = path.read_text("utf-8").splitlines()
     assert "# status: 0 observed, 1 predicted, 2 held, 3 rejected" in lines
     header, *rows = (line.split(",") for line in lines if not line.startswith("#"))

@@ -8,10 +8,10 @@
     0.00833,,,
 
 Comment lines come first; `unit` must be there or be given, `rate` and `frames` are optional. A
-blank or NaN cell is a gap. What tracking adds is read with a note alone: columns that end in `.deg`
-(joint angles), and of each marker `NAME.status`, where numbers other than 0 say that it was filled,
-and `NAME.expected_error`, in the file's unit. The markers of a file that we write read back bit for
-bit.
+blank or NaN cell is a gap. Of what tracking adds `NAME.status` is read, where numbers other than 0
+say that the marker was filled, and the rest with a note alone: columns that end in `.deg` (joint
+angles) or `.pose`, and of each marker `NAME.expected_error`, in the file's unit. The markers of a
+file that we write read back bit for bit.
 """
 
 from __future__ import annotations
@@ -61,13 +61,13 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     else:
         rate = median_rate(time, path)
     markers, _ = hide_gaps(table[:, columns] * scale, zeros=False)
-    seen = np.isfinite(markers).all(-1)
     # A blank cell rests on nothing, whatever its status.
-    filled = tuple(
-        name
-        for name, there in zip(names, seen.T, strict=True)
-        if name in status and (table[there, status[name]] > 0).any()
-    )
+    seen = np.isfinite(markers).all(-1)
+    told = np.full(seen.shape, np.nan)
+    for i, name in enumerate(names):
+        if name in status:
+            told[:, i] = np.where(seen[:, i], table[:, status[name]], np.nan)
+    filled = tuple(name for name, own in zip(names, told.T, strict=True) if (own > 0).any())
     recording = Recording(
         names=names,
         markers=markers,
@@ -75,6 +75,7 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         rate=rate,
         source=str(path),
         unit=scale,
+        status=told if status else None,
         filled=filled,
         notes=file.notes + notes,
     )
