@@ -340,6 +340,30 @@ def test_what_is_no_unit_is_refused_with_what_would_be(text: str) -> None:
     assert repr(text) in str(error.value)
 
 
+ZEROS = """# unit: mm
+time,a.x,a.y,a.z,b.x,b.y,b.z,c.x,c.y,c.z
+0,200,1,2,0,0,0,0,0,0
+0.01,0,0.0,-0,1,0,500,0,0,0
+0.02,201,1,2,0,0,501,0,0,0
+"""
+
+
+def test_plain_csv_takes_zeros_as_gaps_where_markers_jump_there(put: Callable) -> None:
+    recording = read(put("take.csv", ZEROS))
+    seen = [[True, False, False], [False, True, False], [True, True, False]]
+    np.testing.assert_array_equal(recording.visible, seen)
+    assert "5 positions of exactly 0 0 0 are taken as gaps" in recording.notes
+    ours = read(put("ours.csv", f"# gaps: blank\n{ZEROS}"))
+    assert ours.visible.all()
+    assert not ours.notes
+    for near in ("99", "-99"):  # millimetres: what a marker may go in a frame
+        passing = ZEROS.replace("200", near).replace("201", near)
+        passing = passing.replace("500", near).replace("501", near)
+        recording = read(put("passing.csv", passing))
+        assert recording.visible.all()
+        assert not recording.notes
+
+
 def test_plain_csv_notes_the_angles_that_it_skips(put: Callable) -> None:
     assert "1 columns of tracking (.deg) are not markers" in read(put("take.csv", CSV)).notes
 
