@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from jaxhand.calibration import DENSE, Calibration, calibrate, new_hand
+from jaxhand.calibration import DENSE, ELSEWHERE, Calibration, Priors, calibrate
 from jaxhand.hand_size import ALIKE, SIZES, Size, hand_size
 from jaxhand.joint_evaluation import evaluate_poses
 from jaxhand.options import Unit
@@ -31,6 +31,11 @@ FAR, FAR_OF_MANY = 15e-3, 4e-3
 and with `DENSE` or more (mean). With `glove9` recorded hands are 11 to 13 mm off and simulated ones
 5 to 15, for markers sit elsewhere on everybody; with `qualisys13` up to 18, but where they are more
 than 15 off, the sizes found are worse than the model's own. Many are 3 mm off at most."""
+FAR_OF_NEW, MOVED_FAR = 10e-3, 40e-3
+"""Metres: what makes a poor description of a glove, a mean distance to the fitted markers, or a
+marker so far from where the glove like it has it. Simulated gloves are 0.2 to 0.4 mm off and their
+markers at most 24 mm away, recorded ones mostly 0.2 to 4 mm and 35 mm; of the other side, or with
+labels exchanged on the back of the hand, nearly all are beyond one of the two."""
 OTHER_SIDE = 0.95
 """A hand that fits so much nearer as one of the other side is taken for one. Of recorded and
 simulated hands, on their own side none was below 0.99, on the other most were below 0.93."""
@@ -108,8 +113,8 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
     wearer.save(person, config.out, overwrite=config.overwrite)
     for line in said:
         console.print(line)
-    for finger in unseen:
-        console.print(f"not seen yet: the {finger}; bend and stretch it for a better fit")
+    for line in _unseen(seen):
+        console.print(line)
     console.print(
         f"wrote {config.out}; HandTracker.load(…, calibration=…) and jaxhand track "
         "--calibration take it"
@@ -127,18 +132,15 @@ def describe_glove(config: HandConfig, console: Console | None = None) -> None:
     like, recording = load_hand(config.like), _read(config)
     markers = _markers(recording, like, config)
     with console.status("fitting bones, offsets, angles and poses"):
-        hand = new_hand(
-            like,
-            like.markers,
-            markers,
-            rate=recording.rate,
-            name=config.name or config.out.stem,
-        )
-    hand = replace(hand, sources=(f"fitted to a recording, from {like.name}",))
+        found = calibrate(like, markers, rate=recording.rate, priors=Priors(offset=ELSEWHERE))
+    hand = replace(
+        found.hand,
+        name=config.name or config.out.stem,
+        sources=(f"fitted to a recording, from {like.name}",),
+    )
     config.out.write_text(json.dumps(hand.to_json(), indent=1) + "\n", "utf-8")
-    moved = 1e3 * np.linalg.norm(hand.template - like.template, axis=-1)
-    for name, distance in zip(hand.markers, moved, strict=True):
-        console.print(f"{name}: {distance:.0f} mm from where {like.name} has it")
+    for line in _of_glove(found, like):
+        console.print(line)
     console.print(f"wrote {config.out}")
 
 
@@ -190,6 +192,35 @@ def _flat(model: Model, markers: Array) -> Array:
     poses = evaluate_poses(replace(model, alignment=False), markers.astype(np.float32))
     angles: Array = poses.angles
     return angles.mean(0)
+
+
+def _unseen(seen: Array) -> list[str]:
+    """What is said of fingers, `[5]` False where they moved too little."""
+    return [
+        f"not seen yet: the {finger}; bend and stretch it for a better fit"
+        for finger, known in zip(FINGERS, seen, strict=True)
+        if not known
+    ]
+
+
+def _of_glove(found: Calibration, like: Hand) -> list[str]:
+    """What is said of a new glove's markers, and of how well they fit."""
+    moved = np.linalg.norm(found.hand.template - like.template, axis=-1)
+    off = float(np.nanmean(found.residual))
+    said = [
+        f"{name}: {1e3 * distance:.0f} mm from where {like.name} has it"
+        for name, distance in zip(like.markers, moved, strict=True)
+    ]
+    said.append(f"markers fit within {1e3 * off:.1f} mm on average (usual: up to 4 mm)")
+    said += _unseen(found.seen)
+    far = [name for name, distance in zip(like.markers, moved, strict=True) if distance > MOVED_FAR]
+    if off > FAR_OF_NEW or far:
+        where = f"; {', '.join(far)} far from where {like.name} has them" if far else ""
+        said.append(
+            f"a poor fit, which may do harm{where}: are the labels right, is it a right hand "
+            "(--right), did every finger move?"
+        )
+    return said
 
 
 def _bones(found: Calibration, model: Hand) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,6 +133,43 @@ def test_a_fit_that_is_none_is_told_of(
             assert not side or f"as a {side} hand they fit better" in printed
 
 
+def test_how_well_a_new_glove_fits_is_told(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Poor with labels exchanged on the back of the hand, and of the wrong side."""
+    out = ["-o", str(tmp_path / "mine.json"), "--overwrite"]
+    for name, right, poor in (
+        ("left", [], False),
+        ("right", ["--right"], False),
+        ("mislabelled", [], True),
+        ("right", [], True),
+    ):
+        assert cli.hand([str(folder / f"{name}.csv"), *out, *right]) == 0
+        printed = capsys.readouterr().out
+        (off,) = re.findall(r"fit within (.*) mm on average \(usual: up to 4 mm\)", printed)
+        assert (float(off) > 10) == poor
+        assert ("a poor fit" in printed) == poor
+        assert "wrote" in printed
+
+
+def test_a_marker_far_from_its_place_is_named() -> None:
+    """However well it then fits; and so are fingers that did not move."""
+    away = np.zeros((9, 3))
+    away[5, 0], away[6, 0] = 0.05, 0.03
+    found = Calibration(**dict.fromkeys(Calibration._fields))._replace(
+        hand=replace(GLOVE, offsets=GLOVE.offsets + away).with_skeleton(GLOVE.skeleton),
+        residual=np.full((3, 9), 1e-3),
+        seen=np.array([True, True, False, True, True]),
+    )
+    said = glove._of_glove(found, GLOVE)
+    assert any(f"harm; {GLOVE.markers[5]} far from where glove9 has them" in line for line in said)
+    assert [line for line in said if line.startswith("not seen")] == [
+        "not seen yet: the middle; bend and stretch it for a better fit"
+    ]
+    found = found._replace(hand=GLOVE)
+    assert not any("a poor fit" in line for line in glove._of_glove(found, GLOVE))
+
+
 @pytest.mark.parametrize("user", ["User1", "User2", "User3"])
 def test_a_recorded_hand_is_of_its_own_side(
     user: str, data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -224,6 +262,6 @@ def test_a_wrong_output_is_refused_before_the_glove_is_fitted(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(glove, "new_hand", lambda *_, **__: pytest.fail("fitted first"))
+    monkeypatch.setattr(glove, "calibrate", lambda *_, **__: pytest.fail("fitted first"))
     assert cli.hand([str(folder / "left.csv"), "-o", str(tmp_path / out)]) == 2
     assert "folder" in capsys.readouterr().err
