@@ -19,7 +19,7 @@ from numpy_infer import wearer
 from numpy_infer.arrays import Array
 from numpy_infer.cli import check_output
 from numpy_infer.geometry import mirror
-from numpy_infer.hand import FINGERS, POINTS, Hand, load_hand
+from numpy_infer.hand import ANGLES, FINGER_OF_ANGLE, FINGERS, POINTS, Hand, load_hand
 from numpy_infer.labels import doubted_unit, of_hand
 from numpy_infer.model import Model
 from numpy_infer.model import load as load_model
@@ -36,6 +36,13 @@ FAR_OF_NEW, MOVED_FAR = 10e-3, 40e-3
 marker so far from where the glove like it has it. Simulated gloves are 0.2 to 0.4 mm off and their
 markers at most 24 mm away, recorded ones mostly 0.2 to 4 mm and 35 mm; of the other side, or with
 labels exchanged on the back of the hand, nearly all are beyond one of the two."""
+BENT = 20.0
+"""Degrees by which the fingers' flexions may be off on average where a flat hand is to be held. On
+simulated people, with markers 5 mm per axis from where the bundled models have them, that was up to
+14; while the hand moved freely, in half of the seconds above 33."""
+_FLEXIONS = [
+    i for i, a in enumerate(ANGLES) if a.name.endswith("_flexion") and FINGER_OF_ANGLE[i] > 0
+]
 OTHER_SIDE = 0.95
 """A hand that fits so much nearer as one of the other side is taken for one. Of recorded and
 simulated hands, on their own side none was below 0.99, on the other most were below 0.93."""
@@ -108,7 +115,15 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
                 change = "no --right, or --left-prefix" if _is_right(config) else "see --right"
                 said.append(f"as a {side} hand they fit better, within {off:.1f} mm: {change}")
     unseen = tuple(finger for finger, known in zip(FINGERS, seen, strict=True) if not known)
-    flat = None if held is None else _flat(worn_by(model, hand), markers[held])
+    flat = None
+    if held is not None:
+        angles = _angles(worn_by(model, hand), markers[held])
+        flat, bent = angles.mean(0), _bent(angles)
+        if bent > BENT:
+            said.append(
+                f"--flat: in those seconds the fingers are bent by up to {bent:.0f}° on average "
+                f"(usual: up to {BENT:.0f}°): was the hand flat? If not, all angles will be off"
+            )
     person = Wearer(hand, flat, unseen)
     wearer.save(person, config.out, overwrite=config.overwrite)
     for line in said:
@@ -186,12 +201,19 @@ def _held(
     return held
 
 
-def _flat(model: Model, markers: Array) -> Array:
-    """`[26]` radians: what the joint network says of a flat hand `[N, M, 3]`, in metres. The model
-    is the one that will run, on the person's own bones."""
+def _angles(model: Model, markers: Array) -> Array:
+    """`[N, 26]` radians: what the joint network says of frames `[N, M, 3]`, in metres. The model is
+    the one that will run, on the person's own bones."""
     poses = evaluate_poses(replace(model, alignment=False), markers.astype(np.float32))
     angles: Array = poses.angles
-    return angles.mean(0)
+    return angles
+
+
+def _bent(angles: Array) -> float:
+    """Degrees that the fingers, the thumb apart, are bent on average of their joints, or stretched
+    too far, in all but a twentieth of frames `[N, 26]`."""
+    bends = np.degrees(angles[:, _FLEXIONS].mean(-1))
+    return float(np.quantile(np.abs(bends), 0.95))
 
 
 def _unseen(seen: Array) -> list[str]:

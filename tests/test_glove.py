@@ -21,7 +21,7 @@ from jaxhand.calibration import Calibration
 from jaxhand.datasets import SIG18_AS_GLOVE9
 from numpy_infer import HandTracker, load_hand, model, wearer
 from numpy_infer.geometry import mirror
-from numpy_infer.hand import POINTS
+from numpy_infer.hand import ANGLES, POINTS
 from numpy_infer.recordings import Recording, read, write
 
 GLOVE = load_hand("glove9")
@@ -76,6 +76,29 @@ def test_a_larger_hand_held_as_it_was_when_flat_is_flat(folder: Path, tmp_path: 
     tracker = HandTracker.load(folder / "model.npz", calibration=out)
     angles = np.array([tracker.step(markers, 1 / RATE).angles for markers in held])
     assert np.degrees(np.abs(angles.mean(0)).max()) < 0.05
+
+
+def test_a_hand_that_is_not_flat_is_told_of(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Flat until the first second is over; bent, or not flat to the end."""
+    out = ["--model", str(folder / "model.npz"), "-o", str(tmp_path / "me.json"), "--overwrite"]
+    for since, until, told in (("0", "0.9", False), ("2", "6", True), ("0", "6", True)):
+        flat = ["--flat", since, until]
+        assert cli.calibrate([str(folder / "left.csv"), *out, *flat]) == 0
+        assert ("--flat: in those seconds the fingers" in capsys.readouterr().out) == told
+
+
+@pytest.mark.parametrize("degrees", [-30, -10, 0, 10, 30])
+def test_bent_is_what_the_fingers_are_together_and_seldom_one_frame(degrees: float) -> None:
+    angles = np.zeros((100, len(ANGLES)))
+    angles[:, :5], angles[:, 12] = 1.0, 0.5  # the thumb, and one joint of twelve
+    assert glove._bent(angles) < 3
+    flexions = [a.name.endswith("_flexion") for a in ANGLES]
+    angles[:, flexions] = np.radians(degrees)
+    assert glove._bent(angles) == pytest.approx(abs(degrees))
+    angles[::30, flexions] = np.radians(80)
+    assert glove._bent(angles) == pytest.approx(abs(degrees))
 
 
 def test_a_glove_is_described_by_its_motion(folder: Path, tmp_path: Path) -> None:
