@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
@@ -26,7 +27,7 @@ from numpy_infer.labels import (
     prefixed,
     tracked_without,
 )
-from numpy_infer.recordings import Recording, read
+from numpy_infer.recordings import Recording, load_label_map, read
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
 HANDS = [load_hand(name) for name in bundled()]
@@ -151,6 +152,29 @@ def test_what_the_labels_of_a_hand_begin_with_is_found(
         assert told.endswith(f"see {' '.join(options)}")
     assert not beginnings(hand.markers)
     assert not beginnings([f"L_{name}" for name in hand.markers[:3]])
+
+
+def test_a_label_map_is_read_from_json(tmp_path: Path) -> None:
+    path = tmp_path / "map.json"
+    path.write_text(json.dumps({"LTHF": "thumb_tip", "LEHAL": "wrist"}))
+    assert load_label_map(path) == {"LTHF": "thumb_tip", "LEHAL": "wrist"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": "b",\n}', r"map\.json:2: not JSON"),
+        ('["a"]', "expected an object"),
+        ('{"a": 1}', "'a': expected a name, got 1"),
+        ('{"a": "b", "a": "c"}', "duplicate entry 'a'"),
+        ('{"a": "c", "b": "c"}', "duplicate name 'c'"),
+    ],
+)
+def test_a_broken_label_map_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "map.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_label_map(path)
 
 
 # -- its markers ---------------------------------------------------------------------------------

@@ -86,7 +86,7 @@ REFUSED: dict[str, tuple[Callable[[dict[str, bytes]], Any], str]] = {
     "another format": (head(lambda h: h.update(format="zip")), "its header says nothing of"),
     "no header": (drop("header.npy"), "it has no header"),
     "header is no text": (put("header.npy", np.full(9, 255, np.uint8)), "not UTF-8 text"),
-    "header is no JSON": (put("header.npy", np.zeros(9, np.uint8)), ""),
+    "header is no JSON": (put("header.npy", np.zeros(9, np.uint8)), "not JSON: Expecting"),
     "header is a list": (put("header.npy", np.frombuffer(b"[]", np.uint8)), "not a model file"),
     "header is floats": (put("header.npy", np.zeros(9)), "'header': expected"),
     "header is a scalar": (put("header.npy", np.uint8(3)), "'header': expected shape"),

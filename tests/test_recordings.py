@@ -1,6 +1,5 @@
 """Laws of recordings: what any reader gives, what any writer keeps, what any damage does."""
 
-import json
 import sys
 import tomllib
 from dataclasses import replace
@@ -18,7 +17,7 @@ from numpy_infer import recordings
 from numpy_infer.formats import plain_csv, qualisys, trc
 from numpy_infer.formats.authors import read_hand_csv
 from numpy_infer.pose import Status
-from numpy_infer.recordings import JointTruth, Recording, load_label_map, median_rate, read, write
+from numpy_infer.recordings import JointTruth, Recording, median_rate, read, write
 
 # Metres lost by writing and reading: CSV keeps every digit, TRC and TSV nanometres, C3D float32.
 PRECISION = {".csv": 0.0, ".trc": 2e-9, ".tsv": 2e-9, ".c3d": 2e-6}
@@ -314,29 +313,6 @@ def test_prefixes_that_alone_tell_labels_apart_need_a_label_map(tmp_path: Path) 
     with pytest.raises(ValueError, match="duplicate marker name 'a', from 'Left:a' and 'Right:a'"):
         read(path)
     assert read(path, label_map={"Right:a": "other"}).names == ("a", "other")
-
-
-def test_a_label_map_is_read_from_json(tmp_path: Path) -> None:
-    path = tmp_path / "map.json"
-    path.write_text(json.dumps({"LTHF": "thumb_tip", "LEHAL": "wrist"}))
-    assert load_label_map(path) == {"LTHF": "thumb_tip", "LEHAL": "wrist"}
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('{"a": "b",\n}', r"map\.json:2: not JSON"),
-        ('["a"]', "expected an object"),
-        ('{"a": 1}', "'a': expected a name, got 1"),
-        ('{"a": "b", "a": "c"}', "duplicate entry 'a'"),
-        ('{"a": "c", "b": "c"}', "duplicate name 'c'"),
-    ],
-)
-def test_a_broken_label_map_is_refused(text: str, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "map.json"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=message):
-        load_label_map(path)
 
 
 def test_writing_replaces_a_file_only_when_told(tmp_path: Path) -> None:
