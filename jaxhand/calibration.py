@@ -48,6 +48,9 @@ ROUNDS, SETTLED = 8, 0.02
 LEAST_NOISE = 0.1e-3
 """Metres: no markers are better than this."""
 
+ELSEWHERE = 10e-3
+"""Metres: how far the markers of a new glove may be from those of one like it; standard deviation
+per axis."""
 NARROWED = 0.7
 """An unknown is observed if its standard deviation is below this part of what the priors leave when
 all others are known."""
@@ -173,7 +176,7 @@ def new_hand(
     markers: Array,
     *,
     rate: float = 60.0,
-    offset: float = 10e-3,
+    offset: float = ELSEWHERE,
     name: str | None = None,
 ) -> Hand:
     """A hand file for a new glove, out of some ten seconds of flat and free motion.

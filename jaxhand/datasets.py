@@ -38,6 +38,7 @@ from numpy_infer.hand import (
     Hand,
     load_hand,
 )
+from numpy_infer.labels import of_hand
 from numpy_infer.recordings import READER_OF, Recording, load_label_map, read
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
@@ -130,7 +131,10 @@ def load(
     """
     spec = parse_spec(spec) if isinstance(spec, str) else spec
     if spec.name not in SOURCES:
-        raise ValueError(f"no data set {spec.name!r}: expected one of {', '.join(SOURCES)}")
+        raise ValueError(
+            f"no data set {spec.name!r}: expected one of {', '.join(SOURCES)}, or, to train on, "
+            f"{SIMULATED}"
+        )
     source = SOURCES[spec.name]
     if (unit is not None or left_handed) and spec.name != OWN:
         raise ValueError(f"unit and left_handed are for {OWN}: files of {spec.name} are known")
@@ -177,14 +181,14 @@ def _measured(
         label_map = load_label_map(labels) if labels.exists() else None
         recording = read(
             path, label_map=label_map, unit=reading.unit, left_handed=reading.left_handed
-        )
+        ).measured()
         take, named = _without_side(path.stem)
         sequences.append(_sequence(recording, hand, take, side or named))
     return Dataset("", hand, tuple(sequences))
 
 
 def _sequence(recording: Recording, hand: Hand, take: str, side: str) -> Sequence:
-    markers = resample(recording.time, recording.select(hand.markers).markers)
+    markers = resample(recording.time, of_hand(recording, "", hand).markers)
     markers = (mirror(markers) if side == "right" else markers).astype(np.float32)
     return Sequence(f"{take}/{side}", take, RATE, markers)
 

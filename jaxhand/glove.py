@@ -11,15 +11,16 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from jaxhand.calibration import DENSE, Calibration, calibrate, new_hand
+from jaxhand.calibration import DENSE, ELSEWHERE, Calibration, Priors, calibrate
 from jaxhand.hand_size import ALIKE, SIZES, Size, hand_size
 from jaxhand.joint_evaluation import evaluate_poses
+from jaxhand.options import Unit
 from numpy_infer import wearer
 from numpy_infer.arrays import Array
 from numpy_infer.cli import check_output
 from numpy_infer.geometry import mirror
-from numpy_infer.hand import FINGERS, POINTS, Hand, load_hand
-from numpy_infer.labels import doubted_unit, labels_of
+from numpy_infer.hand import ANGLES, FINGER_OF_ANGLE, FINGERS, POINTS, Hand, load_hand
+from numpy_infer.labels import doubted_unit, of_hand
 from numpy_infer.model import Model
 from numpy_infer.model import load as load_model
 from numpy_infer.recordings import Recording, load_label_map, read
@@ -30,6 +31,18 @@ FAR, FAR_OF_MANY = 15e-3, 4e-3
 and with `DENSE` or more (mean). With `glove9` recorded hands are 11 to 13 mm off and simulated ones
 5 to 15, for markers sit elsewhere on everybody; with `qualisys13` up to 18, but where they are more
 than 15 off, the sizes found are worse than the model's own. Many are 3 mm off at most."""
+FAR_OF_NEW, MOVED_FAR = 10e-3, 40e-3
+"""Metres: what makes a poor description of a glove, a mean distance to the fitted markers, or a
+marker so far from where the glove like it has it. Simulated gloves are 0.2 to 0.4 mm off and their
+markers at most 24 mm away, recorded ones mostly 0.2 to 4 mm and 35 mm; of the other side, or with
+labels exchanged on the back of the hand, nearly all are beyond one of the two."""
+BENT = 20.0
+"""Degrees by which the fingers' flexions may be off on average where a flat hand is to be held. On
+simulated people, with markers 5 mm per axis from where the bundled models have them, that was up to
+14; while the hand moved freely, in half of the seconds above 33."""
+_FLEXIONS = [
+    i for i, a in enumerate(ANGLES) if a.name.endswith("_flexion") and FINGER_OF_ANGLE[i] > 0
+]
 OTHER_SIDE = 0.95
 """A hand that fits so much nearer as one of the other side is taken for one. Of recorded and
 simulated hands, on their own side none was below 0.99, on the other most were below 0.93."""
@@ -49,8 +62,8 @@ class _File:
     """The same of a right hand."""
     map: Path | None = None
     """JSON file {"label in the file": "marker"}."""
-    unit: float | None = None
-    """Metres per unit, where the file does not say."""
+    unit: Unit = None
+    """The file's unit, where it does not say."""
     left_handed: bool = False
     """The file's coordinates are left-handed."""
     overwrite: bool = False
@@ -102,13 +115,21 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
                 change = "no --right, or --left-prefix" if _is_right(config) else "see --right"
                 said.append(f"as a {side} hand they fit better, within {off:.1f} mm: {change}")
     unseen = tuple(finger for finger, known in zip(FINGERS, seen, strict=True) if not known)
-    flat = None if held is None else _flat(worn_by(model, hand), markers[held])
+    flat = None
+    if held is not None:
+        angles = _angles(worn_by(model, hand), markers[held])
+        flat, bent = angles.mean(0), _bent(angles)
+        if bent > BENT:
+            said.append(
+                f"--flat: in those seconds the fingers are bent by up to {bent:.0f}° on average "
+                f"(usual: up to {BENT:.0f}°): was the hand flat? If not, all angles will be off"
+            )
     person = Wearer(hand, flat, unseen)
     wearer.save(person, config.out, overwrite=config.overwrite)
     for line in said:
         console.print(line)
-    for finger in unseen:
-        console.print(f"not seen yet: the {finger}; bend and stretch it for a better fit")
+    for line in _unseen(seen):
+        console.print(line)
     console.print(
         f"wrote {config.out}; HandTracker.load(…, calibration=…) and jaxhand track "
         "--calibration take it"
@@ -126,18 +147,15 @@ def describe_glove(config: HandConfig, console: Console | None = None) -> None:
     like, recording = load_hand(config.like), _read(config)
     markers = _markers(recording, like, config)
     with console.status("fitting bones, offsets, angles and poses"):
-        hand = new_hand(
-            like,
-            like.markers,
-            markers,
-            rate=recording.rate,
-            name=config.name or config.out.stem,
-        )
-    hand = replace(hand, sources=(f"fitted to a recording, from {like.name}",))
+        found = calibrate(like, markers, rate=recording.rate, priors=Priors(offset=ELSEWHERE))
+    hand = replace(
+        found.hand,
+        name=config.name or config.out.stem,
+        sources=(f"fitted to a recording, from {like.name}",),
+    )
     config.out.write_text(json.dumps(hand.to_json(), indent=1) + "\n", "utf-8")
-    moved = 1e3 * np.linalg.norm(hand.template - like.template, axis=-1)
-    for name, distance in zip(hand.markers, moved, strict=True):
-        console.print(f"{name}: {distance:.0f} mm from where {like.name} has it")
+    for line in _of_glove(found, like):
+        console.print(line)
     console.print(f"wrote {config.out}")
 
 
@@ -150,14 +168,13 @@ def _read(config: _File) -> Recording:
         unit=config.unit,
         left_handed=config.left_handed,
         label_map=load_label_map(config.map) if config.map else None,
-    )
+    ).measured()
 
 
 def _markers(recording: Recording, hand: Hand, config: _File) -> Array:
     """`[T, M, 3]` metres, of a canonical left hand, all of whose labels are there."""
     prefix = config.left_prefix or config.right_prefix
-    labels_of(recording, prefix)
-    own = recording.select([prefix + name for name in hand.markers])
+    own = of_hand(recording, prefix, hand)
     if doubt := doubted_unit(replace(own, names=hand.markers, filled=()), hand):
         raise ValueError(doubt)
     return mirror(own.markers) if _is_right(config) else own.markers
@@ -184,12 +201,48 @@ def _held(
     return held
 
 
-def _flat(model: Model, markers: Array) -> Array:
-    """`[26]` radians: what the joint network says of a flat hand `[N, M, 3]`, in metres. The model
-    is the one that will run, on the person's own bones."""
+def _angles(model: Model, markers: Array) -> Array:
+    """`[N, 26]` radians: what the joint network says of frames `[N, M, 3]`, in metres. The model is
+    the one that will run, on the person's own bones."""
     poses = evaluate_poses(replace(model, alignment=False), markers.astype(np.float32))
     angles: Array = poses.angles
-    return angles.mean(0)
+    return angles
+
+
+def _bent(angles: Array) -> float:
+    """Degrees that the fingers, the thumb apart, are bent on average of their joints, or stretched
+    too far, in all but a twentieth of frames `[N, 26]`."""
+    bends = np.degrees(angles[:, _FLEXIONS].mean(-1))
+    return float(np.quantile(np.abs(bends), 0.95))
+
+
+def _unseen(seen: Array) -> list[str]:
+    """What is said of fingers, `[5]` False where they moved too little."""
+    return [
+        f"not seen yet: the {finger}; bend and stretch it for a better fit"
+        for finger, known in zip(FINGERS, seen, strict=True)
+        if not known
+    ]
+
+
+def _of_glove(found: Calibration, like: Hand) -> list[str]:
+    """What is said of a new glove's markers, and of how well they fit."""
+    moved = np.linalg.norm(found.hand.template - like.template, axis=-1)
+    off = float(np.nanmean(found.residual))
+    said = [
+        f"{name}: {1e3 * distance:.0f} mm from where {like.name} has it"
+        for name, distance in zip(like.markers, moved, strict=True)
+    ]
+    said.append(f"markers fit within {1e3 * off:.1f} mm on average (usual: up to 4 mm)")
+    said += _unseen(found.seen)
+    far = [name for name, distance in zip(like.markers, moved, strict=True) if distance > MOVED_FAR]
+    if off > FAR_OF_NEW or far:
+        where = f"; {', '.join(far)} far from where {like.name} has them" if far else ""
+        said.append(
+            f"a poor fit, which may do harm{where}: are the labels right, is it a right hand "
+            "(--right), did every finger move?"
+        )
+    return said
 
 
 def _bones(found: Calibration, model: Hand) -> list[str]:

@@ -22,11 +22,13 @@ from jaxhand.anthropometry import people
 from jaxhand.cameras import Rig, film
 from jaxhand.compiled import compiled
 from jaxhand.datasets import SIMULATED
+from jaxhand.options import Unit
 from jaxhand.pictures import check_picture, occlusions_picture
 from jaxhand.two_hands import two_hands
 from numpy_infer.arrays import Array
 from numpy_infer.cli import check_output
 from numpy_infer.hand import Hand, bundled, load_hand
+from numpy_infer.labels import advice
 from numpy_infer.recordings import Recording, load_label_map, read
 
 QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
@@ -285,8 +287,8 @@ class OcclusionsConfig:
     """The same of a right hand."""
     map: Path | None = None
     """JSON file {"label in the file": "marker"}."""
-    unit: float | None = None
-    """Metres per unit, where the file does not say."""
+    unit: Unit = None
+    """The file's unit, where it does not say."""
     left_handed: bool = False
     """The file's coordinates are left-handed."""
     json: Path | None = None
@@ -357,7 +359,7 @@ def _recorded(config: OcclusionsConfig, console: Console) -> dict[str, Occlusion
     for file in config.files:
         recording = read(
             file, unit=config.unit, left_handed=config.left_handed, label_map=label_map
-        )
+        ).measured()
         hand, hands = hands_in(recording, config.hand, config.left_prefix, config.right_prefix)
         layouts.add((hand.markers, recording.rate))
         if len(layouts) > 1:
@@ -387,10 +389,11 @@ def hands_in(
         there = [own for own in sides if known >= set(own) or (name and known & set(own))]
         if there:
             return hand, [recording.select(own).visible for own in there]
-    raise ValueError(
+    text = (
         f"{recording.source}: no hand fits the labels {', '.join(recording.names)}: name one with "
         "--hand, its prefixes with --left-prefix and --right-prefix, or rename with --map"
     )
+    raise ValueError("; ".join([text, *advice(recording.names)]))
 
 
 def print_tables(tables: Mapping[str, Occlusions], console: Console) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from numpy_infer.formats.units import metres
 from numpy_infer.networks import Dense, Spec, read_spec
 
 Takes = Annotated[
@@ -24,6 +25,18 @@ Takes = Annotated[
 
 DataSets = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 """`--data NAME[:PATH][@WEIGHT]`, as often as wanted."""
+
+Unit = Annotated[
+    float | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="mm|cm|m|in|METRES",
+        instance_from_str=lambda arguments: metres(arguments[0]),
+        is_instance=lambda value: value is None or isinstance(value, float),
+        str_from_instance=lambda value: [f"{value:g}" if value else "what the file says"],
+    ),
+]
+"""Metres in one unit of a file, or the unit's name."""
 
 AlsoModels = Annotated[tuple[str, ...], tyro.conf.UseAppendAction]
 """`--also NAME=FILE`, likewise."""

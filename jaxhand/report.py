@@ -18,7 +18,7 @@ from jaxhand import joint_evaluation
 from jaxhand.datasets import load
 from jaxhand.evaluation import COUNTS, DURATIONS, SEEDS, Report, mean_ratio, methods, table3
 from jaxhand.joint_evaluation import joint_errors
-from jaxhand.options import AlsoModels, DataSets, Takes
+from jaxhand.options import AlsoModels, DataSets, Takes, Unit
 from jaxhand.pictures import check_picture, table_picture
 from jaxhand.sequences import Dataset
 from numpy_infer.cli import check_output
@@ -46,8 +46,8 @@ class EvaluationConfig:
     truth: Path | None = None
     """Folder that keeps joint truth fitted to dense markers (SIG18, minutes for each user), which
     Table 4 needs: written if it is not there yet, read if it is."""
-    unit: float | None = None
-    """Metres per unit of `recordings` whose files do not say."""
+    unit: Unit = None
+    """The unit of `recordings` whose files do not say."""
     left_handed: bool = False
     """The coordinates of `recordings` are left-handed."""
     json: Path | None = None

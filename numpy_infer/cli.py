@@ -16,8 +16,17 @@ import numpy as np
 
 from numpy_infer import wearer
 from numpy_infer.arrays import Array
+from numpy_infer.formats.units import metres
 from numpy_infer.hand import ANGLES, HIGH, LOW, POINTS, Hand, bundled, load_hand
-from numpy_infer.labels import doubted_unit, fitting_hand, labels_of, lacking, prefixed, unfitting
+from numpy_infer.labels import (
+    doubted_unit,
+    doubts,
+    fitting_hand,
+    labels_of,
+    prefixed,
+    unfitting,
+    without,
+)
 from numpy_infer.model import Model, load
 from numpy_infer.model import bundled as bundled_models
 from numpy_infer.one_euro import Smoothing
@@ -30,6 +39,8 @@ STRAINED = 8.0
 """Degrees out of its range that an angle at a knuckle, or at the thumb's base, may be half of the
 time. Of 51 recordings of their own side, SIG18's users 1 to 3, none was more than 6 out, of the
 other side four were less; of 72 simulated hands none, and ten."""
+_BLANK = -1
+"""In place of a status: nothing was written."""
 _KNUCKLES = [i for i, a in enumerate(ANGLES) if a.joint.endswith(("cmc", "mcp"))]
 
 VERBS = {
@@ -186,7 +197,11 @@ def check_output(path: Path, *, overwrite: bool) -> None:
 def _add_file(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("file", type=Path, help="TRC, Qualisys TSV, CSV, Motive CSV, BVH, C3D, …")
     verb.add_argument("--map", type=Path, help='JSON file {"label in the file": "marker"}')
-    verb.add_argument("--unit", type=float, help="metres per unit, where the file does not say")
+    verb.add_argument(
+        "--unit",
+        metavar="U",
+        help="the file's, where it does not say: mm, cm, m, in, or a number of metres",
+    )
     verb.add_argument(
         "--left-handed", action="store_true", help="the file's coordinates are left-handed"
     )
@@ -195,10 +210,10 @@ def _add_file(verb: argparse.ArgumentParser) -> None:
 def _read(options: argparse.Namespace) -> Recording:
     return read(
         options.file,
-        unit=options.unit,
+        unit=None if options.unit is None else metres(options.unit),
         left_handed=options.left_handed,
         label_map=load_label_map(options.map) if options.map else None,
-    )
+    ).measured()
 
 
 def _inspect(options: argparse.Namespace) -> None:
@@ -246,7 +261,7 @@ def describe(recording: Recording) -> dict[str, Any]:
         "seconds": float(recording.time[-1] - recording.time[0]),
         "rate": recording.rate,
         "unit_m": recording.unit,
-        "notes": [*recording.notes, *_doubts(recording)],
+        "notes": [*recording.notes, *doubts(recording)],
         "markers": markers,
         "hands": {
             name: [m for m in load_hand(name).markers if m not in recording.names]
@@ -255,14 +270,9 @@ def describe(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _doubts(recording: Recording) -> list[str]:
-    """What is wrong with the size of the hand that fits, if one does."""
-    hand = fitting_hand(recording.names)
-    doubt = doubted_unit(prefixed(recording, "", hand), hand) if hand else None
-    return [doubt] if doubt else []
-
-
 def _track(options: argparse.Namespace) -> None:
+    if options.smooth is not None and not 0 < options.smooth < np.inf:
+        raise ValueError(f"--smooth: expected a cutoff above 0 Hz, got {options.smooth:g}")
     outputs = _outputs(options)
     for output in outputs.values():
         writer_of(output)
@@ -293,8 +303,11 @@ def _track(options: argparse.Namespace) -> None:
 
     hands = [prefixed(recording, prefixes[side], model.hand) for side in outputs]
     for side, own in zip(outputs, labels, strict=True):
-        if absent := lacking(model.hand, own):
-            print(_without(model.hand, absent, own, prefixes[side]), file=sys.stderr)
+        if told := without(model.hand, own, prefixes[side]):
+            print(f"jaxhand track: {told}", file=sys.stderr)
+    for hand in hands:
+        if doubt := doubted_unit(hand, model.body):
+            raise ValueError(f"{options.file}: {doubt}")
     if len(hands) == 1:
         results = [track(hands[0], model, right="right" in outputs, report=report)]
     else:
@@ -304,13 +317,13 @@ def _track(options: argparse.Namespace) -> None:
         print(file=sys.stderr)
     if options.as_measured:
         results = [as_measured(result, hand) for result, hand in zip(results, hands, strict=True)]
-    for (side, output), hand, result in zip(outputs.items(), hands, results, strict=True):
+    for (side, output), result in zip(outputs.items(), results, strict=True):
         write(result.recording, output, overwrite=options.overwrite)
         if len(outputs) > 1:
             print(f"{side} hand")
         elif side == "left" and "right" in options.file.stem.lower():
             print("tracked as a left hand, though the file's name says right: see --right")
-        print(_summary(result, doubted_unit(hand, model.body)))
+        print(_summary(result))
         print(f"wrote {output}")
 
 
@@ -324,33 +337,23 @@ def _outputs(options: argparse.Namespace) -> dict[str, Path]:
     return {"right" if options.right or options.right_prefix else "left": out}
 
 
-def _without(hand: Hand, absent: Sequence[str], labels: Sequence[str], prefix: str) -> str:
-    """What is said of labels that a file lacks, and which of those it has might be them."""
-    surplus = [prefix + label for label in labels if label not in hand.markers]
-    named = f"; labels not used: {', '.join(surplus)} (--map renames)" if surplus else ""
-    return (
-        f"jaxhand track: no label {', '.join(prefix + name for name in absent)}: tracked as never "
-        f"seen{named}"
-    )
-
-
-def _summary(result: Tracked, doubt: str | None) -> str:
-    """What is said of a hand that was tracked. doubt: what is wrong with its size."""
-    status, state = result.status, result.state
+def _summary(result: Tracked) -> str:
+    """What is said of a hand that was tracked."""
+    state, there = result.state, result.recording.visible
+    status = np.where(there, result.status, _BLANK)
     lines = [f"{len(state)} frames, {len(result.recording.names)} markers"]
     for name, text in (
         (Status.OBSERVED, "measured"),
         (Status.PREDICTED, "filled from what was seen in the frame"),
         (Status.HELD, "held: nothing in the frame determined them, or says how far off they are"),
         (Status.REJECTED, "measured at a wrong place, it seems, and filled (see --no-gate)"),
+        (_BLANK, "left blank: nothing fills them, or the hand had not been tracked yet"),
     ):
         share = 100 * (status == name).mean()
-        if share or name != Status.REJECTED:
+        if share or name == Status.OBSERVED:
             lines.append(f"{share:6.2f} % of the markers {text}")
     far = (result.notice & Notice.SUSPECTED_MILLIMETRES) > 0
-    if doubt:
-        lines.append(doubt)
-    elif far.any():
+    if far.any():
         lines.append(
             f"{100 * far.mean():6.2f} % of the frames have a marker over a metre from the others"
         )
@@ -360,7 +363,7 @@ def _summary(result: Tracked, doubt: str | None) -> str:
     if hidden.any():
         error = 1e3 * result.expected_error[hidden].mean()
         lines.append(f"filled ones, seen before, are expected to be {error:.0f} mm off on average")
-    never = ~seen[-1] & result.recording.visible.any(0)
+    never = ~seen[-1] & there.any(0)
     if never.any():
         names = np.array(result.recording.names)[never]
         lines.append(f"never seen: {', '.join(names)}; filled all the same, centimetres off maybe")

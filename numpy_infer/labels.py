@@ -1,11 +1,13 @@
-"""A file's labels beside a hand's markers: which hand they are of, what it lacks, and whether that
-hand is as large as hands are."""
+"""A file's labels beside a hand's markers: which hand they are of, what it lacks, what was meant,
+and whether that hand is as large as hands are."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
+from difflib import get_close_matches
 from math import log10
+from shlex import quote
 
 import numpy as np
 
@@ -18,6 +20,10 @@ from numpy_infer.recordings import Recording
 DISPENSABLE = 1 / 3
 """Share of a hand's markers that a file may have no label of. With so many never seen, the bundled
 networks fill those to 2 or 3 cm, simulated hands or recorded ones; with more, worse."""
+CLOSE = 0.8
+"""A label that is so much like a marker's name (`difflib`'s ratio) may be meant for it: one letter
+of five may be wrong. Names of the bundled hands, such as ThumbIP and ThumbTip, are as near each
+other, so a label that is one of them is meant for no other."""
 FRAMES = 600
 """At most so many frames tell a hand's size, evenly spread."""
 
@@ -39,6 +45,82 @@ def lacking(hand: Hand, labels: Collection[str]) -> list[str]:
     return [name for name in hand.markers if name not in labels]
 
 
+def meant(hand: Hand, labels: Collection[str]) -> dict[str, str]:
+    """{label: marker} of those that are no marker's name, but nearly that of one that is lacking:
+    cases, spaces, hyphens and the like do not count, nor a letter or two."""
+    absent = {_plain(name): name for name in lacking(hand, labels)}
+    names = {name for known in bundled() for name in load_hand(known).markers} | set(hand.markers)
+    found: dict[str, str] = {}
+    for likeness, others in ((1.0, hand.markers), (CLOSE, names)):
+        for label in labels:
+            alike = [name for name in absent if _digits(name) == _digits(label)]
+            near = get_close_matches(_plain(label), alike, 1, likeness)
+            if near and label not in others and label not in found:
+                found[label] = absent.pop(near[0])
+    return found
+
+
+def _plain(label: str) -> str:
+    return "".join(filter(str.isalnum, label.lower()))
+
+
+def _digits(label: str) -> str:
+    return "".join(filter(str.isdigit, label))
+
+
+def beginnings(labels: Collection[str]) -> dict[str, Hand]:
+    """{prefix: hand} of the bundled hands whose labels all begin with something."""
+    names = [name for known in bundled() for name in load_hand(known).markers]
+    ends = [label.removesuffix(name) for label in labels for name in names if label.endswith(name)]
+    hands = {
+        prefix: fitting_hand([one.removeprefix(prefix) for one in labels if one.startswith(prefix)])
+        for prefix in dict.fromkeys(filter(None, ends))
+    }
+    return {prefix: hand for prefix, hand in hands.items() if hand is not None}
+
+
+def advice(labels: Collection[str], hand: Hand | None = None, prefix: str = "") -> list[str]:
+    """What may be wrong with labels of which a hand lacks some.
+
+    Args:
+        labels: all that there are, or with a prefix those that begin with it, without it.
+        hand: the hand; by default the bundled one that then lacks fewest.
+        prefix: what they begin with in the file.
+    """
+    hands = [hand] if hand else list(map(load_hand, bundled()))
+    begun = beginnings(labels)
+    if begun and all(len(lacking(one, labels)) == len(one) for one in hands):
+        return [prefixes_told(begun)]
+    own = [label for label in labels if not label.startswith(tuple(begun))]
+    left = [len(lacking(one, own)) - len(meant(one, own)) for one in hands]
+    found = meant(hands[left.index(min(left))], own)
+    pairs = [f"{prefix}{name} by {prefix}{label}" for label, name in found.items()]
+    return [f"did you mean {', '.join(pairs)}? (--map renames)"] if pairs else []
+
+
+def prefixes_told(begun: Collection[str]) -> str:
+    """What is said of labels that begin with these."""
+    sides = [{"l": "left", "r": "right"}.get(_plain(prefix)[:1]) for prefix in begun]
+    if None in sides or len(set(sides)) < len(sides):
+        options = ["--left-prefix", "--right-prefix"]
+    else:
+        options = [f"--{side}-prefix {quote(p)}" for side, p in zip(sides, begun, strict=True)]
+    return f"labels of a hand begin with {' and '.join(begun)}: see {' '.join(options)}"
+
+
+def of_hand(recording: Recording, prefix: str, hand: Hand) -> Recording:
+    """The markers of one hand whose labels all begin with `prefix`, in the hand's own order.
+
+    Raises:
+        ValueError: some are lacking; with the labels that there are, and what may help.
+    """
+    labels = labels_of(recording, prefix)
+    try:
+        return recording.select([prefix + name for name in hand.markers])
+    except ValueError as error:
+        raise ValueError("; ".join([str(error), *advice(labels, hand, prefix)])) from None
+
+
 def tracked_without(hand: Hand, absent: Collection[str]) -> bool:
     """Whether a hand can be tracked of which these markers are never seen: at most `DISPENSABLE` of
     all, and those left determine where it is."""
@@ -57,7 +139,7 @@ def prefixed(recording: Recording, prefix: str, hand: Hand) -> Recording:
     absent = [prefix + name for name in lacking(hand, labels_of(recording, prefix))]
     wanted = [prefix + name for name in hand.markers]
     if not tracked_without(hand, [name.removeprefix(prefix) for name in absent]):
-        absent = []
+        of_hand(recording, prefix, hand)
     own = recording.select([name for name in wanted if name not in absent])
     markers = np.full((len(own.time), len(hand), 3), np.nan)
     markers[:, [wanted.index(name) for name in own.names]] = own.markers
@@ -90,11 +172,39 @@ def unfitting(labels: Collection[str], instead: str) -> str:
     nearest = _by_fit(labels)[0]
     absent = lacking(nearest, labels)
     if len(absent) < len(nearest):
-        return f"{text}; {nearest.name} lacks {', '.join(absent)}"
-    own = [name for hand in bundled() for name in load_hand(hand).markers]
-    if any(label.endswith(f"_{name}") for label in labels for name in own):
-        return f"{text}; --left-prefix or --right-prefix says what labels of a hand begin with"
-    return text
+        text += f"; {nearest.name} lacks {', '.join(absent)}"
+        return "; ".join([text, *advice(labels, nearest)])
+    return "; ".join([text, *advice(labels)])
+
+
+def without(hand: Hand, labels: Collection[str], prefix: str = "") -> str | None:
+    """What is said of labels that a file lacks, and which of those it has might be them.
+
+    Args:
+        labels: those that begin with the prefix, without it.
+        prefix: what they begin with in the file.
+    """
+    absent = [prefix + name for name in lacking(hand, labels)]
+    if not absent:
+        return None
+    text = f"no label {', '.join(absent)}: tracked as never seen"
+    surplus = [prefix + label for label in labels if label not in hand.markers]
+    advised = advice(labels, hand, prefix)
+    if surplus:
+        text += f"; labels not used: {', '.join(surplus)}{'' if advised else ' (--map renames)'}"
+    return "; ".join([text, *advised])
+
+
+def doubts(recording: Recording) -> list[str]:
+    """What `jaxhand inspect` has to say of a recording's labels, and of its hands' size."""
+    labels = recording.names
+    begun, hand = beginnings(labels), fitting_hand(labels)
+    found = [*begun.items(), *([("", hand)] if hand else [])]
+    said = [prefixes_told(begun)] if begun else []
+    if not begun or hand:
+        said += advice(labels, hand)
+    sizes = [doubted_unit(prefixed(recording, *one), one[1]) for one in found]
+    return [*said, *dict.fromkeys(filter(None, sizes))]
 
 
 def _by_fit(labels: Collection[str]) -> list[Hand]:

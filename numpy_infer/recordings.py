@@ -7,9 +7,8 @@ handedness and each format's way of writing a gap end here, at the file's edge.
 from __future__ import annotations
 
 import importlib
-import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
@@ -20,6 +19,7 @@ import numpy as np
 
 from numpy_infer.formats.json_text import read_json
 from numpy_infer.formats.refusal import refusal, shortened
+from numpy_infer.formats.units import LARGEST
 
 BUILT_IN = {
     name: f"numpy_infer.formats.{name}"
@@ -82,7 +82,7 @@ class Recording:
     joints: joint truth, if the file has any.
     angles: [T, 26] radians, in the order of `hand.ANGLES`: what tracking made of the markers.
     wrist: [T, 7] of the wrist joint metres, and the quaternion xyzw of its rotation: likewise.
-    status: [T, M] a `pose.Status` each: what tracking says that a marker rests on.
+    status: [T, M] a `pose.Status` each: what tracking says that a marker rests on; NaN unknown.
     expected_error: [T, M] metres: how far off tracking expects it to be.
     filled: names whose values are partly made up, by the recording software or by tracking.
     notes: one-line things that the reader wants the user to know.
@@ -135,6 +135,23 @@ class Recording:
         """[T, M] True where all three coordinates are finite."""
         return np.isfinite(self.markers).all(axis=-1)
 
+    def measured(self) -> Recording:
+        """What was measured alone: a marker that tracking filled is hidden, as `status` says."""
+        if self.status is None:
+            return self
+        made = self.visible & (self.status > 0)
+        note = f"{made.sum()} positions that tracking had filled (.status) are taken as gaps"
+        return replace(
+            self,
+            markers=np.where(made[..., None], np.nan, self.markers),
+            angles=None,
+            wrist=None,
+            status=None,
+            expected_error=None,
+            filled=tuple(name for name in self.filled if not made[:, self.names.index(name)].any()),
+            notes=(*self.notes, note) if made.any() else self.notes,
+        )
+
     def select(self, names: Sequence[str]) -> Recording:
         """The given markers only, in the given order; ValueError lists those that are missing."""
         _check_known(names, self.names, f"{self.source}: ")
@@ -185,7 +202,7 @@ def read(
     half read. A file that is not there is the usual FileNotFoundError.
     """
     path = Path(path)
-    if unit is not None and not 0 < unit < 1e6:
+    if unit is not None and not 0 < unit < LARGEST:
         raise ValueError(f"unit: expected metres per file unit, got {unit}")
     reader = _reader(path, format)
     try:
@@ -217,8 +234,6 @@ def load_label_map(path: str | os.PathLike[str]) -> dict[str, str]:
     path = Path(path)
     try:
         mapping = read_json(path)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path}:{error.lineno}: not JSON: {error.msg}") from None
     except ValueError as error:
         raise refusal(path, error) from None
     if not isinstance(mapping, dict):
@@ -296,7 +311,8 @@ def _csv_format(path: Path) -> str:
 def _relabelled(recording: Recording, label_map: Mapping[str, str]) -> Recording:
     """Our names for mapped labels; the others without their `Subject:` prefix."""
     bare = {label: _without_prefix(label) for label in recording.names}
-    _check_known(label_map, (*bare, *bare.values()), f"{recording.source}: label map: ")
+    there = dict.fromkeys((*bare, *bare.values()))
+    _check_known(label_map, there, f"{recording.source}: label map: ")
     names = {label: label_map.get(label, label_map.get(bare[label], bare[label])) for label in bare}
     by_name: dict[str, str] = {}
     for label, name in names.items():
@@ -324,7 +340,7 @@ def _check_unique(names: Sequence[str], what: str, where: str = "") -> None:
         seen.add(name)
 
 
-def _check_known(asked: Iterable[str], names: Sequence[str], where: str) -> None:
+def _check_known(asked: Iterable[str], names: Collection[str], where: str) -> None:
     known = set(names)
     missing = [name for name in asked if name not in known]
     if missing:

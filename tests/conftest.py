@@ -15,6 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, settings
+from model_files import whole_model
+
+from numpy_infer.model import Model, save
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -203,3 +206,16 @@ def data_root() -> Path:
             pytest.fail(message)
         pytest.skip(message)
     return root
+
+
+@pytest.fixture
+def model() -> Model:
+    """A model of every part there is."""
+    return whole_model()
+
+
+@pytest.fixture
+def path(model: Model, tmp_path: Path) -> Path:
+    """Its file."""
+    save(model, tmp_path / "model.npz")
+    return tmp_path / "model.npz"

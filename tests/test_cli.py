@@ -195,6 +195,27 @@ def test_a_filled_table_says_what_was_measured_and_how_far_off_the_rest_may_be(
         )
 
 
+def test_what_was_filled_once_is_hidden_when_it_is_tracked_again(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read(take)
+    markers = recording.markers + 1e-3 * np.random.default_rng(0).normal(size=(30, 9, 3))
+    markers[10:20, 3] = markers[15:, 7] = markers[22:24] = np.nan
+    write(replace(recording, markers=markers), tmp_path / "0.csv")
+    for once, again in (("0", "1"), ("1", "2")):
+        assert main(["track", f"{once}.csv", "-o", f"{again}.csv", "--as-measured"]) == 0
+    assert Path("1.csv").read_bytes() == Path("2.csv").read_bytes()
+    capsys.readouterr()
+    gaps = []
+    for name in ("0.csv", "1.csv"):
+        assert main(["inspect", name, "--json"]) == 0
+        gaps.append(json.loads(capsys.readouterr().out))
+    assert gaps[0]["markers"] == gaps[1]["markers"]
+    hidden = np.isnan(markers).all(-1).sum()
+    note = f"{hidden} positions that tracking had filled (.status) are taken as gaps"
+    assert note in gaps[1]["notes"]
+
+
 def test_hands_say_where_their_markers_sit(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["hands"]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -214,11 +235,11 @@ def test_knuckles_out_of_their_range_are_told_of(capsys: pytest.CaptureFixture[s
         recording = replace(recording, status=nothing, expected_error=nothing)
         notice = nothing[:, 0].astype(int)
         result = Tracked(replace(recording, angles=angles), nothing[:, 0], notice)
-        assert ("out of their range" in _summary(result, None)) == told
+        assert ("out of their range" in _summary(result)) == told
     never = replace(recording, angles=np.full((4, len(ANGLES)), np.nan))
     lost = nothing[:, 0] + TrackingState.LOST
-    assert "out of their range" not in _summary(replace(result, recording=never, state=lost), None)
-    assert "no joint angles" in _summary(replace(result, recording=recording), None)
+    assert "out of their range" not in _summary(replace(result, recording=never, state=lost))
+    assert "no joint angles" in _summary(replace(result, recording=recording))
 
 
 def test_a_name_that_says_right_is_heard(take: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -249,11 +270,33 @@ def test_a_label_that_the_file_lacks_is_as_an_empty_column_and_told_of(
             assert Path("out.csv").read_bytes() == Path("expected.csv").read_bytes()
             error = capsys.readouterr().err
             assert f"no label {HAND.markers[8]}: tracked as never seen" in error
-            used = f"labels not used: {HAND.markers[8]}? (--map renames)"
+            used = f"labels not used: {HAND.markers[8]}?; did you mean {HAND.markers[8]} by "
             assert (used in error) == (name == "misspelt.csv")
+            assert ("--map" in error) == (name == "misspelt.csv")
             assert error.count("\n") == 1
-    assert main(["track", "without.csv", "--predictor", "none", "-o", "o.csv"]) == 0
-    assert "never seen" not in capsys.readouterr().out, "nothing is filled"
+
+
+@pytest.mark.parametrize("predictor", ["none", "affine"])
+def test_what_is_left_blank_is_not_said_to_be_filled(
+    predictor: str, take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Never seen, hidden, at a wrong place; and, whatever fills, all before the first frame."""
+    recording = read(take).select(HAND.markers[:-1])
+    markers = recording.markers + 1e-3 * np.random.default_rng(0).normal(size=(30, 8, 3))
+    markers[:3] = markers[10:20, 3] = np.nan
+    markers[15:, 5] += 0.3
+    write(replace(recording, markers=markers), tmp_path / "gap.csv")
+    assert main(["track", "gap.csv", "--predictor", predictor, "-o", "out.csv"]) == 0
+    printed = capsys.readouterr().out
+    assert ("filled" in printed) == (predictor != "none")
+    told = [
+        line.split(" % of the markers ") for line in printed.splitlines() if "% of the m" in line
+    ]
+    shares = {text: float(share) for share, text in told}
+    seen = np.isfinite(read("out.csv").markers).all(-1)
+    assert sum(shares.values()) == pytest.approx(100, abs=0.05)
+    (blank,) = (share for text, share in shares.items() if text.startswith("left blank: "))
+    assert blank == pytest.approx(100 * (1 - seen.mean()), abs=0.01)
 
 
 def test_what_to_expect_is_said_of_markers_that_were_seen() -> None:
@@ -267,9 +310,41 @@ def test_what_to_expect_is_said_of_markers_that_were_seen() -> None:
     made = Recording(
         HAND.markers, markers, time, 60.0, source="", status=status, expected_error=off
     )
-    said = _summary(Tracked(made, np.zeros(4), np.zeros(4, int)), None)
+    said = _summary(Tracked(made, np.zeros(4), np.zeros(4, int)))
     assert "filled ones, seen before, are expected to be 5 mm off" in said
     assert f"never seen: {', '.join(HAND.markers[3:])}; filled" in said
+
+
+def test_a_label_that_is_nearly_a_markers_name_is_asked_about(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = "did you mean index_tip by index_tp? (--map renames)"
+    write(read(take).rename({"index_tip": "index_tp"}), tmp_path / "tp.csv")
+    assert main(["inspect", "tp.csv"]) == 0
+    assert f"note: {asked}\n" in capsys.readouterr().out
+    assert main(["track", "tp.csv", "-o", "out.csv"]) == 0
+    assert asked in capsys.readouterr().err
+    write(read(take).rename({name: name.title() for name in HAND.markers}), tmp_path / "all.csv")
+    pairs = ", ".join(f"{name} by {name.title()}" for name in HAND.markers)
+    for model in ([], ["--model", "glove9"]):
+        error = refused(["track", "all.csv", "-o", "out.csv", "--overwrite", *model], capsys)
+        assert f"; did you mean {pairs}? (--map renames)" in error
+
+
+def test_prefixes_of_two_hands_are_pointed_out(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = [prefix + name for prefix in ("R_", "L_") for name in HAND.markers]
+    whole = read(take)
+    both = np.concatenate([whole.markers, 1000 * whole.markers], 1)
+    write(replace(whole, names=names, markers=both, filled=()), tmp_path / "both.csv")
+    begun = "labels of a hand begin with R_ and L_: see --right-prefix R_ --left-prefix L_"
+    assert main(["inspect", "both.csv"]) == 0
+    printed = capsys.readouterr().out
+    assert f"note: {begun}\n" in printed
+    assert "1000 times too large" in printed, "the left one is looked at, too"
+    assert begun in refused(["track", "both.csv", "-o", "out.csv"], capsys)
+    assert begun in refused(["track", "both.csv", "--model", "glove9", "-o", "out.csv"], capsys)
 
 
 def test_too_few_labels_are_refused_with_what_is_lacking(
@@ -284,6 +359,15 @@ def test_too_few_labels_are_refused_with_what_is_lacking(
     assert "--left-prefix" in refused(["track", "left.csv", "-o", "out.csv"], capsys)
 
 
+@pytest.mark.parametrize("hertz", ["0", "-1", "nan", "inf"])
+def test_a_cutoff_that_is_none_is_refused_before_the_work(
+    hertz: str, take: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(numpy_infer.cli, "read", lambda *_, **__: pytest.fail("worked first"))
+    error = refused(["track", take, "-o", "out.csv", "--smooth", hertz], capsys)
+    assert error == f"jaxhand track: --smooth: expected a cutoff above 0 Hz, got {hertz}\n"
+
+
 @pytest.mark.parametrize(
     ("factor", "said"),
     [
@@ -292,7 +376,7 @@ def test_too_few_labels_are_refused_with_what_is_lacking(
         (1, ()),
     ],
 )
-def test_a_wrong_unit_is_told_of(
+def test_a_wrong_unit_is_told_of_and_not_tracked(
     factor: float,
     said: tuple[str, ...],
     take: str,
@@ -301,12 +385,30 @@ def test_a_wrong_unit_is_told_of(
 ) -> None:
     recording = read(take)
     write(replace(recording, markers=factor * recording.markers), tmp_path / "other.csv")
-    for arguments in (["inspect", "other.csv"], ["track", "other.csv", "-o", "out.csv"]):
-        assert main(arguments) == 0
-        printed = capsys.readouterr().out
+    assert main(["inspect", "other.csv"]) == 0
+    told = capsys.readouterr().out
+    assert main(["track", "other.csv", "-o", "out.csv"]) == (2 if said else 0)
+    refusal = capsys.readouterr().err
+    assert Path("out.csv").exists() == (not said), "nothing that may be taken for the hand"
+    for printed in (told, refusal):
         assert all(part in printed for part in said)
         assert ("for a hand" in printed) == bool(said)
-        assert "over a metre" not in printed, "the unit is reason enough"
+    assert refusal.count("\n") == bool(said)
+
+
+@pytest.mark.parametrize("verb", [["inspect"], ["track", "-o", "out.csv", "--overwrite"]])
+def test_a_unit_may_be_named(
+    verb: list[str], take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read(take)
+    write(replace(recording, markers=1e3 * recording.markers), tmp_path / "bare.csv")
+    text = Path("bare.csv").read_text()
+    Path("bare.csv").write_text(text.replace("# unit: m\n", ""))
+    assert "--unit mm" in refused([*verb, "bare.csv"], capsys)
+    assert "got 'furlong'" in refused([*verb, "bare.csv", "--unit", "furlong"], capsys)
+    for unit in ("mm", "0.001"):
+        assert main([*verb, "bare.csv", "--unit", unit]) == 0
+        assert "for a hand" not in capsys.readouterr().out
 
 
 def test_one_marker_far_away_is_no_matter_of_units(

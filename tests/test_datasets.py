@@ -54,7 +54,7 @@ def test_a_bad_spec_is_refused(text: str) -> None:
 
 
 def test_an_unknown_data_set_lists_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"(?s)sig81.*manipnet, sig18, qualisys"):
+    with pytest.raises(ValueError, match=r"(?s)sig81.*manipnet, sig18, qualisys.*simulated$"):
         load("sig81:x", "train")
 
 
@@ -177,6 +177,17 @@ def test_labels_beside_the_recordings_are_used(tmp_path: Path) -> None:
     labels = {f"m{i}": name for i, name in enumerate(HAND.markers)}
     (tmp_path / "labels.json").write_text(json.dumps(labels))
     assert load(f"recordings:{tmp_path / 'a.trc'}@3", "test").weight == 3
+
+
+def test_what_tracking_filled_is_no_recording_to_learn_from(tmp_path: Path) -> None:
+    glove = load_hand("glove9")
+    status = np.zeros((60, 9))
+    status[20:40, 3] = 1
+    markers = np.repeat(glove.template[None], 60, 0)
+    take = Recording(glove.markers, markers, np.arange(60) / 60, 60.0, "", status=status)
+    write(take, tmp_path / "a.csv")
+    (sequence,) = load(f"recordings:{tmp_path / 'a.csv'}", "test").sequences
+    np.testing.assert_array_equal(np.isnan(sequence.markers).all(-1), status > 0)
 
 
 def test_complete_frames_are_those_with_every_marker() -> None:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from numpy_infer.formats.authors import read_hand_csv
 from numpy_infer.formats.bvh import read_bvh
+from numpy_infer.formats.units import metres
 from numpy_infer.recordings import read
 
 TRC = """PathFileType\t4\t(X/Y/Z)\ttake.trc
@@ -318,9 +319,49 @@ def test_qualisys_may_lack_its_column_names_or_frame_and_time(put: Callable) -> 
 
 def test_plain_csv_without_a_unit_asks_for_it(put: Callable) -> None:
     path = put("take.csv", CSV.removeprefix("# unit: mm\n"))
-    with pytest.raises(ValueError, match="does not state its unit; pass --unit METRES"):
+    with pytest.raises(ValueError, match="does not state its unit; pass --unit mm "):
         read(path)
     np.testing.assert_allclose(read(path, unit=1e-3).markers, MARKERS)
+
+
+@given(
+    st.sampled_from([("mm", 1e-3), ("cm", 1e-2), ("M", 1.0), (" in ", 0.0254), ("feet", 0.3048)])
+    | st.floats(1e-9, 1e5).map(lambda number: (repr(number), number))
+)
+def test_a_user_names_a_unit_or_says_how_many_metres_it_is(said: tuple[str, float]) -> None:
+    text, wanted = said
+    assert metres(text) == wanted
+
+
+@pytest.mark.parametrize("text", ["furlong", "", "0", "-1", "nan", "inf", "1e6", "1 mm"])
+def test_what_is_no_unit_is_refused_with_what_would_be(text: str) -> None:
+    with pytest.raises(ValueError, match=r"unit: expected mm, cm, m, in, .*, got '") as error:
+        metres(text)
+    assert repr(text) in str(error.value)
+
+
+ZEROS = """# unit: mm
+time,a.x,a.y,a.z,b.x,b.y,b.z,c.x,c.y,c.z
+0,200,1,2,0,0,0,0,0,0
+0.01,0,0.0,-0,1,0,500,0,0,0
+0.02,201,1,2,0,0,501,0,0,0
+"""
+
+
+def test_plain_csv_takes_zeros_as_gaps_where_markers_jump_there(put: Callable) -> None:
+    recording = read(put("take.csv", ZEROS))
+    seen = [[True, False, False], [False, True, False], [True, True, False]]
+    np.testing.assert_array_equal(recording.visible, seen)
+    assert "5 positions of exactly 0 0 0 are taken as gaps" in recording.notes
+    ours = read(put("ours.csv", f"# gaps: blank\n{ZEROS}"))
+    assert ours.visible.all()
+    assert not ours.notes
+    for near in ("99", "-99"):  # millimetres: what a marker may go in a frame
+        passing = ZEROS.replace("200", near).replace("201", near)
+        passing = passing.replace("500", near).replace("501", near)
+        recording = read(put("passing.csv", passing))
+        assert recording.visible.all()
+        assert not recording.notes
 
 
 def test_plain_csv_notes_the_angles_that_it_skips(put: Callable) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,12 +16,12 @@ from fitted import fitted_model
 from rich.console import Console
 from simulated import motion, worn
 
-from jaxhand import cli, glove
+from jaxhand import cli, glove, occlusions, report
 from jaxhand.calibration import Calibration
 from jaxhand.datasets import SIG18_AS_GLOVE9
 from numpy_infer import HandTracker, load_hand, model, wearer
 from numpy_infer.geometry import mirror
-from numpy_infer.hand import POINTS
+from numpy_infer.hand import ANGLES, POINTS
 from numpy_infer.recordings import Recording, read, write
 
 GLOVE = load_hand("glove9")
@@ -77,6 +78,29 @@ def test_a_larger_hand_held_as_it_was_when_flat_is_flat(folder: Path, tmp_path: 
     assert np.degrees(np.abs(angles.mean(0)).max()) < 0.05
 
 
+def test_a_hand_that_is_not_flat_is_told_of(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Flat until the first second is over; bent, or not flat to the end."""
+    out = ["--model", str(folder / "model.npz"), "-o", str(tmp_path / "me.json"), "--overwrite"]
+    for since, until, told in (("0", "0.9", False), ("2", "6", True), ("0", "6", True)):
+        flat = ["--flat", since, until]
+        assert cli.calibrate([str(folder / "left.csv"), *out, *flat]) == 0
+        assert ("--flat: in those seconds the fingers" in capsys.readouterr().out) == told
+
+
+@pytest.mark.parametrize("degrees", [-30, -10, 0, 10, 30])
+def test_bent_is_what_the_fingers_are_together_and_seldom_one_frame(degrees: float) -> None:
+    angles = np.zeros((100, len(ANGLES)))
+    angles[:, :5], angles[:, 12] = 1.0, 0.5  # the thumb, and one joint of twelve
+    assert glove._bent(angles) < 3
+    flexions = [a.name.endswith("_flexion") for a in ANGLES]
+    angles[:, flexions] = np.radians(degrees)
+    assert glove._bent(angles) == pytest.approx(abs(degrees))
+    angles[::30, flexions] = np.radians(80)
+    assert glove._bent(angles) == pytest.approx(abs(degrees))
+
+
 def test_a_glove_is_described_by_its_motion(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "mine.json"
     assert cli.hand([str(folder / "left.csv"), "--like", "glove9", "-o", str(out)]) == 0
@@ -130,6 +154,43 @@ def test_a_fit_that_is_none_is_told_of(
         if side is not None:
             assert ("hand they fit better" in printed) == bool(side)
             assert not side or f"as a {side} hand they fit better" in printed
+
+
+def test_how_well_a_new_glove_fits_is_told(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Poor with labels exchanged on the back of the hand, and of the wrong side."""
+    out = ["-o", str(tmp_path / "mine.json"), "--overwrite"]
+    for name, right, poor in (
+        ("left", [], False),
+        ("right", ["--right"], False),
+        ("mislabelled", [], True),
+        ("right", [], True),
+    ):
+        assert cli.hand([str(folder / f"{name}.csv"), *out, *right]) == 0
+        printed = capsys.readouterr().out
+        (off,) = re.findall(r"fit within (.*) mm on average \(usual: up to 4 mm\)", printed)
+        assert (float(off) > 10) == poor
+        assert ("a poor fit" in printed) == poor
+        assert "wrote" in printed
+
+
+def test_a_marker_far_from_its_place_is_named() -> None:
+    """However well it then fits; and so are fingers that did not move."""
+    away = np.zeros((9, 3))
+    away[5, 0], away[6, 0] = 0.05, 0.03
+    found = Calibration(**dict.fromkeys(Calibration._fields))._replace(
+        hand=replace(GLOVE, offsets=GLOVE.offsets + away).with_skeleton(GLOVE.skeleton),
+        residual=np.full((3, 9), 1e-3),
+        seen=np.array([True, True, False, True, True]),
+    )
+    said = glove._of_glove(found, GLOVE)
+    assert any(f"harm; {GLOVE.markers[5]} far from where glove9 has them" in line for line in said)
+    assert [line for line in said if line.startswith("not seen")] == [
+        "not seen yet: the middle; bend and stretch it for a better fit"
+    ]
+    found = found._replace(hand=GLOVE)
+    assert not any("a poor fit" in line for line in glove._of_glove(found, GLOVE))
 
 
 @pytest.mark.parametrize("user", ["User1", "User2", "User3"])
@@ -197,6 +258,25 @@ def test_a_mistake_is_one_clear_line_before_the_fit(
     assert not (tmp_path / "me.json").exists()
 
 
+@pytest.mark.parametrize(
+    ("config", "arguments"),
+    [
+        (glove.CalibrateConfig, ["a.csv", "-o", "b.json", "--model", "glove9"]),
+        (glove.HandConfig, ["a.csv", "-o", "b.json"]),
+        (occlusions.OcclusionsConfig, ["a.csv"]),
+        (report.EvaluationConfig, ["--data", "recordings:a"]),
+    ],
+)
+def test_a_unit_may_be_named(
+    config: type, arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    for given, unit in (([], None), (["--unit", "mm"], 1e-3), (["--unit", "0.5"], 0.5)):
+        assert cli._parsed(config, [*arguments, *given], "verb", "").unit == unit
+    with pytest.raises(SystemExit):
+        cli._parsed(config, [*arguments, "--unit", "furlong"], "verb", "")
+    assert "expected mm, cm" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("out", ["nodir/mine.json", "."])
 def test_a_wrong_output_is_refused_before_the_glove_is_fitted(
     out: str,
@@ -205,6 +285,6 @@ def test_a_wrong_output_is_refused_before_the_glove_is_fitted(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(glove, "new_hand", lambda *_, **__: pytest.fail("fitted first"))
+    monkeypatch.setattr(glove, "calibrate", lambda *_, **__: pytest.fail("fitted first"))
     assert cli.hand([str(folder / "left.csv"), "-o", str(tmp_path / out)]) == 2
     assert "folder" in capsys.readouterr().err

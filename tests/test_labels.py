@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 
 import numpy as np
 import pytest
@@ -16,13 +18,16 @@ from numpy_infer.geometry import transform
 from numpy_infer.hand import HIGH, LOW, Hand, bundled, load_hand
 from numpy_infer.labels import (
     DISPENSABLE,
+    advice,
+    beginnings,
     doubted_unit,
     fitting_hand,
     lacking,
+    meant,
     prefixed,
     tracked_without,
 )
-from numpy_infer.recordings import Recording, read
+from numpy_infer.recordings import Recording, load_label_map, read
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
 HANDS = [load_hand(name) for name in bundled()]
@@ -76,6 +81,100 @@ def test_what_is_left_determines_where_the_hand_is() -> None:
     line = np.array([[0.0, 0, 0], [0.05, 0, 0], [0.1, 0, 0], [0, 0.05, 0]])
     told = [tracked_without(replace(four, template=line), [name]) for name in four.markers]
     assert told == [True, True, True, False]
+
+
+# -- what was meant -----------------------------------------------------------------------------
+
+
+def misspelt(name: str, way: int, at: int) -> str:
+    """In one of several ways: other signs and cases, or a letter too many, too few, exchanged."""
+    at = 1 + at % (len(name) - 1)
+    return (
+        name.upper(),
+        name.replace("_", " "),
+        name.title().replace("_", "-"),
+        name[:at] + name[at - 1] + name[at:],
+        name[:at] + name[at + 1 :],
+        name[:at] + "x" + name[at + 1 :],
+    )[way]
+
+
+@given(hands, st.data(), st.integers(0, 5), st.integers(0, 11))
+def test_a_misspelt_label_is_taken_for_the_marker_that_is_lacking(
+    hand: Hand, data: st.DataObject, way: int, at: int
+) -> None:
+    name = data.draw(st.sampled_from(hand.markers))
+    label = misspelt(name, way, at)
+    labels = data.draw(st.permutations([*lacking(hand, [name]), label, "pillow"]))
+    taken = {one for known in HANDS for one in known.markers}
+    numbers = [[sign for sign in text if sign.isdigit()] for text in (name, label)]
+    if numbers[0] != numbers[1] or label == name or label in taken:
+        assert meant(hand, labels).get(label) in (None, name)
+        return
+    assert meant(hand, labels) == {label: name}
+    assert advice(labels, hand) == [f"did you mean {name} by {label}? (--map renames)"]
+    assert advice(labels) == advice(labels, hand)
+
+
+def test_every_name_may_be_written_in_another_way() -> None:
+    for hand in HANDS:
+        for way in range(3):
+            labels = {misspelt(name, way, 0): name for name in hand.markers}
+            if set(labels) != set(hand.markers):
+                assert meant(hand, labels) == {k: v for k, v in labels.items() if k != v}
+
+
+@pytest.mark.parametrize("hand", HANDS, ids=lambda hand: hand.name)
+def test_what_is_something_else_is_not_taken_for_a_marker(hand: Hand) -> None:
+    """Names of other markers, other numbers, the other hand."""
+    others = {name for known in HANDS for name in known.markers}
+    for name in hand.markers:
+        labels = [*lacking(hand, [name]), *sorted(others - {name})]
+        for label in meant(hand, labels):
+            one, other = (text.lower().replace("_", "") for text in (label, name))
+            assert one == other
+    assert not meant(replace(GLOVE, markers=(*GLOVE.markers[1:], "m 1")), [*GLOVE.markers, "m 2"])
+    right = [f"R_{name}" for name in hand.markers]
+    assert not advice([*hand.markers[1:], *right], hand)
+
+
+@given(hands, st.sampled_from([("L_",), ("R_", "L_"), ("Left ", "Right "), ("a_", "b_")]))
+def test_what_the_labels_of_a_hand_begin_with_is_found(
+    hand: Hand, prefixes: tuple[str, ...]
+) -> None:
+    labels = [prefix + name for prefix in prefixes for name in hand.markers[1:]]
+    assert list(beginnings(["pillow", *labels])) == list(prefixes)
+    (told,) = advice(labels)
+    assert told.startswith(f"labels of a hand begin with {' and '.join(prefixes)}: see --")
+    sides = {"L": "left", "R": "right"}
+    if prefixes[0][0] in sides:
+        options = [f"--{sides[prefix[0]]}-prefix {quote(prefix)}" for prefix in prefixes]
+        assert told.endswith(f"see {' '.join(options)}")
+    assert not beginnings(hand.markers)
+    assert not beginnings([f"L_{name}" for name in hand.markers[:3]])
+
+
+def test_a_label_map_is_read_from_json(tmp_path: Path) -> None:
+    path = tmp_path / "map.json"
+    path.write_text(json.dumps({"LTHF": "thumb_tip", "LEHAL": "wrist"}))
+    assert load_label_map(path) == {"LTHF": "thumb_tip", "LEHAL": "wrist"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('{"a": "b",\n}', r"map\.json:2: not JSON"),
+        ('["a"]', "expected an object"),
+        ('{"a": 1}', "'a': expected a name, got 1"),
+        ('{"a": "b", "a": "c"}', "duplicate entry 'a'"),
+        ('{"a": "c", "b": "c"}', "duplicate name 'c'"),
+    ],
+)
+def test_a_broken_label_map_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "map.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_label_map(path)
 
 
 # -- its markers ---------------------------------------------------------------------------------

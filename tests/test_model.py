@@ -9,23 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from model_files import assert_same, header_of, whole_model
+from model_files import assert_same, header_of
 from streams import a_model
 
 from numpy_infer.model import Model, load, save
 
 Array = np.ndarray
-
-
-@pytest.fixture
-def model() -> Model:
-    return whole_model()
-
-
-@pytest.fixture
-def path(model: Model, tmp_path: Path) -> Path:
-    save(model, tmp_path / "model.npz")
-    return tmp_path / "model.npz"
 
 
 # -- there and back -----------------------------------------------------------------------------

@@ -64,8 +64,9 @@ def test_what_is_wrong_in_a_file_is_named(change: Any, message: str, tmp_path: P
 @pytest.mark.parametrize("content", ["", "[]", "{", '"x"', "[" * 100_000])
 def test_what_is_no_calibration_is_a_value_error(content: str, tmp_path: Path) -> None:
     (tmp_path / "me.json").write_text(content)
-    with pytest.raises(ValueError, match=r"me\.json"):
+    with pytest.raises(ValueError, match=r"me\.json") as error:
         wearer.load(tmp_path / "me.json")
+    assert ("me.json:1: not JSON: Expecting" in str(error.value)) == (content in ("", "{"))
     with pytest.raises(ValueError, match="no calibration file"):
         wearer.load(tmp_path / "nobody.json")
 

@@ -18,14 +18,14 @@ def read_json(file: Path | Traversable) -> Any:
     """The file's data.
 
     Raises:
-        ValueError: it is too large, no UTF-8 text or no JSON, see `parse_json`. The message does
-            not name the file.
+        ValueError: it is too large or refused as by `parse_json`; a `JSONDecodeError`, which knows
+            the line, if it is no JSON. The message does not name the file.
     """
     with file.open("rb") as stream:
         content = stream.read(SIZE_LIMIT + 1)
     if len(content) > SIZE_LIMIT:
         raise ValueError(f"more than {SIZE_LIMIT >> 20} MB of JSON, which no such file has")
-    return parse_json(content)
+    return _data(content)
 
 
 def parse_json(content: bytes, *, finite: bool = False) -> Any:
@@ -36,6 +36,13 @@ def parse_json(content: bytes, *, finite: bool = False) -> Any:
     Raises:
         ValueError: no UTF-8 text, no JSON, an entry twice in an object, or nested too deep.
     """
+    try:
+        return _data(content, finite=finite)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"not JSON: {error}") from None
+
+
+def _data(content: bytes, *, finite: bool = False) -> Any:
     hooks: dict[str, Any] = {"parse_constant": _not_finite, "parse_float": _finite}
     try:
         text = content.decode("utf-8-sig")

@@ -8,10 +8,11 @@
     0.00833,,,
 
 Comment lines come first; `unit` must be there or be given, `rate` and `frames` are optional. A
-blank or NaN cell is a gap. What tracking adds is read with a note alone: columns that end in `.deg`
-(joint angles), and of each marker `NAME.status`, where numbers other than 0 say that it was filled,
-and `NAME.expected_error`, in the file's unit. The markers of a file that we write read back bit for
-bit.
+blank or NaN cell is a gap; so are three exact zeros in a file whose markers jump there, unless it
+says `# gaps: blank`, as those that we write do. Of what tracking adds `NAME.status` is read, where
+numbers other than 0 say that the marker was filled, and the rest with a note alone: columns that
+end in `.deg` (joint angles) or `.pose`, and of each marker `NAME.expected_error`, in the file's
+unit. The markers of a file that we write read back bit for bit.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from numpy_infer.formats.table import (
     number,
     positive,
     read_text,
+    zeros_are_gaps,
 )
 from numpy_infer.formats.units import agreed, metres_per
 from numpy_infer.hand import ANGLES
@@ -60,14 +62,16 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         rate = hertz(positive(*comments["rate"], "rate"), comments["rate"][1], "rate")
     else:
         rate = median_rate(time, path)
-    markers, _ = hide_gaps(table[:, columns] * scale, zeros=False)
-    seen = np.isfinite(markers).all(-1)
+    positions = table[:, columns] * scale
+    blank = comments.get("gaps", ("", ""))[0].lower() == "blank"
+    markers, gaps = hide_gaps(positions, zeros=not blank and zeros_are_gaps(positions))
     # A blank cell rests on nothing, whatever its status.
-    filled = tuple(
-        name
-        for name, there in zip(names, seen.T, strict=True)
-        if name in status and (table[there, status[name]] > 0).any()
-    )
+    seen = np.isfinite(markers).all(-1)
+    told = np.full(seen.shape, np.nan)
+    for i, name in enumerate(names):
+        if name in status:
+            told[:, i] = np.where(seen[:, i], table[:, status[name]], np.nan)
+    filled = tuple(name for name, own in zip(names, told.T, strict=True) if (own > 0).any())
     recording = Recording(
         names=names,
         markers=markers,
@@ -75,8 +79,9 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
         rate=rate,
         source=str(path),
         unit=scale,
+        status=told if status else None,
         filled=filled,
-        notes=file.notes + notes,
+        notes=file.notes + notes + gaps,
     )
     return recording.reflected() if left_handed else recording
 
@@ -99,6 +104,7 @@ def write(recording: Recording, path: Path) -> None:
         "# unit: m",
         f"# rate: {number(recording.rate)}",
         f"# frames: {len(recording.time)}",
+        "# gaps: blank",
     ]
     if recording.status is not None:
         comments.append("# status: " + ", ".join(f"{s.value} {s.name.lower()}" for s in Status))

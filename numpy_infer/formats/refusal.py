@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from json import JSONDecodeError
 from pathlib import Path
 
 LONGEST = 600
@@ -14,7 +15,9 @@ def shortened(message: str) -> str:
 
 
 def refusal(path: str | Path, error: Exception) -> ValueError:
-    """What is wrong, with the file's name before it, once."""
+    """What is wrong, with the file's name before it, once; of text that is no JSON the line."""
+    if isinstance(error, JSONDecodeError):
+        return ValueError(f"{path}:{error.lineno}: not JSON: {error.msg}")
     message = str(error)
     named = message.startswith(str(path))
     return ValueError(shortened(message) if named else f"{path}: {shortened(message)}")

@@ -14,6 +14,9 @@ from numpy_infer.recordings import Recording
 LARGEST = 1e15
 """A number beyond this, in any unit, is no measurement: made of it, others would overflow."""
 
+AWAY = 0.1
+"""Metres: no marker goes so far in a frame."""
+
 RATES = (1e-6, 1e9)
 """Hz: outside these a number is no frame rate."""
 
@@ -121,6 +124,14 @@ def hide_gaps(markers: np.ndarray, *, zeros: bool) -> tuple[np.ndarray, tuple[st
     count = int(at_zero.sum())
     notes = (f"{count} positions of exactly 0 0 0 are taken as gaps",) if count else ()
     return np.where((hidden | at_zero)[..., None], np.nan, markers), notes
+
+
+def zeros_are_gaps(markers: np.ndarray) -> bool:
+    """Whether a file writes gaps as three zeros, by its markers [T, M, 3] in metres: somewhere one
+    is at zero, and in the frame before or after it more than `AWAY` from there."""
+    zero = (markers == 0).all(-1)
+    away = (np.abs(markers) > AWAY).any(-1)
+    return bool((zero[1:] & away[:-1]).any() or (zero[:-1] & away[1:]).any())
 
 
 def check_writable(names: Sequence[str]) -> None:

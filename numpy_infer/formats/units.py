@@ -13,6 +13,9 @@ METRES = {
     **dict.fromkeys(("ft", "foot", "feet"), 0.3048),
 }
 
+LARGEST = 1e6
+"""Metres: no file counts in larger ones."""
+
 
 def metres_per(name: str, where: str) -> float:
     """Metres per unit called `name`; ValueError at `where` (FILE:LINE) for an unknown one."""
@@ -20,6 +23,22 @@ def metres_per(name: str, where: str) -> float:
     if metres is None:
         raise ValueError(f"{where}: unknown unit {name.strip()!r}; known: {', '.join(METRES)}")
     return metres
+
+
+def metres(text: str) -> float:
+    """What a user says one unit of a file is: a unit's name, or how many metres.
+
+    Raises:
+        ValueError: neither, or no number of metres that a unit could have.
+    """
+    named = METRES.get(text.strip().lower())
+    try:
+        number = float(text) if named is None else named
+    except ValueError:
+        number = 0.0
+    if not 0 < number < LARGEST:
+        raise ValueError(f"unit: expected mm, cm, m, in, ft or a number of metres, got {text!r}")
+    return number
 
 
 def agreed(path: Path, stated: float | None, given: float | None) -> float:
@@ -32,7 +51,7 @@ def agreed(path: Path, stated: float | None, given: float | None) -> float:
     metres = given if stated is None else stated
     if metres is None:
         raise ValueError(
-            f"{path}: the file does not state its unit; pass --unit METRES (in Python "
-            "unit=METRES), the metres in one of its units: 0.001 for millimetres"
+            f"{path}: the file does not state its unit; pass --unit mm (cm, m, in), or the metres "
+            "in one of its units: --unit 0.001, in Python unit=0.001"
         )
     return metres
