@@ -31,7 +31,7 @@ from numpy_infer.hand import (
 )
 from numpy_infer.pose import DETERMINED_EXTENT
 
-__all__ = ["Calibration", "Priors", "Unknowns", "calibrate", "new_hand"]
+__all__ = ["Calibration", "Priors", "Unknowns", "calibrate"]
 
 FRAMES = 240
 """Bones and offsets are solved from at most so many frames."""
@@ -48,9 +48,6 @@ ROUNDS, SETTLED = 8, 0.02
 LEAST_NOISE = 0.1e-3
 """Metres: no markers are better than this."""
 
-ELSEWHERE = 10e-3
-"""Metres: how far the markers of a new glove may be from those of one like it; standard deviation
-per axis."""
 NARROWED = 0.7
 """An unknown is observed if its standard deviation is below this part of what the priors leave when
 all others are known."""
@@ -168,36 +165,6 @@ def calibrate(
     blocks = [frames[i : i + BLOCK] for i in range(0, len(frames), BLOCK)]
     done = [_followed(whole.at(block), known.at(block), noise, shared) for block in blocks]
     return _report(whole, done, noise, shared)
-
-
-def new_hand(
-    like: Hand,
-    names: Sequence[str],
-    markers: Array,
-    *,
-    rate: float = 60.0,
-    offset: float = ELSEWHERE,
-    name: str | None = None,
-) -> Hand:
-    """A hand file for a new glove, out of some ten seconds of flat and free motion.
-
-    Args:
-        like: a hand with markers of the same names at roughly these places, each on the same link.
-        names: `[M]` the markers' names, in the order of `markers`.
-        markers: `[T, M, 3]` metres, of a canonical left hand. Not finite: not measured.
-        rate: frames per second.
-        offset: metres, how far off the markers of `like` may be: standard deviation per axis.
-        name: the new hand's; default that of `like`.
-
-    Raises:
-        ValueError: names other than those of `like`, and whatever `calibrate` refuses.
-    """
-    if sorted(names) != sorted(like.markers):
-        raise ValueError(f"names: expected those of {like.name}, {like.markers}, got {names}")
-    order = [list(names).index(marker) for marker in like.markers]
-    priors = Priors(offset=offset)
-    fitted = calibrate(like, np.asarray(markers)[..., order, :], rate=rate, priors=priors).hand
-    return replace(fitted, name=name or like.name)
 
 
 def _check(

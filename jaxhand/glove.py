@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from jaxhand.calibration import DENSE, ELSEWHERE, Calibration, Priors, calibrate
+from jaxhand.calibration import DENSE, Calibration, Priors, calibrate
 from jaxhand.hand_size import ALIKE, SIZES, Size, hand_size
 from jaxhand.joint_evaluation import evaluate_poses
 from jaxhand.options import Unit
@@ -31,6 +31,9 @@ FAR, FAR_OF_MANY = 15e-3, 4e-3
 and with `DENSE` or more (mean). With `glove9` recorded hands are 11 to 13 mm off and simulated ones
 5 to 15, for markers sit elsewhere on everybody; with `qualisys13` up to 18, but where they are more
 than 15 off, the sizes found are worse than the model's own. Many are 3 mm off at most."""
+ELSEWHERE = 10e-3
+"""Metres: how far the markers of a new glove may be from those of one like it; standard deviation
+per axis."""
 FAR_OF_NEW, MOVED_FAR = 10e-3, 40e-3
 """Metres: what makes a poor description of a glove, a mean distance to the fitted markers, or a
 marker so far from where the glove like it has it. Simulated gloves are 0.2 to 0.4 mm off and their

@@ -27,7 +27,7 @@ from jaxhand.datasets import OWN, SIMULATED, parse_spec
 from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
 from jaxhand.occlusions import Occlusions, of_layout
-from jaxhand.options import DataSets, Layers, Takes
+from jaxhand.options import DataSets, Layers, Takes, Unit
 from jaxhand.sparse_fit import prior_of
 from jaxhand.tasks import (
     Augmentation,
@@ -78,8 +78,8 @@ class TrainingConfig:
     truth: Path | None = None
     """Fit joint truth to recordings that hold none but have the markers for it (SIG18,
     minutes for each user), keep it in this folder, and train the joint network on it."""
-    unit: float | None = None
-    """Metres per unit of `recordings` whose files do not say."""
+    unit: Unit = None
+    """Unit of `recordings` whose files do not say."""
     left_handed: bool = False
     """The coordinates of `recordings` are left-handed."""
     marker_layers: Layers = (Dense(200), Dense(150), Dense(200))

@@ -21,7 +21,6 @@ from jaxhand.calibration import (  # noqa: E402
     Priors,
     Unknowns,
     calibrate,
-    new_hand,
 )
 from jaxhand.motion import Motion  # noqa: E402
 from numpy_infer.arrays import Array  # noqa: E402
@@ -293,14 +292,8 @@ def test_a_new_glove_is_found_from_another_one() -> None:
     random, true = np.random.default_rng(0), person(4)
     like = replace(DENSE, offsets=true.hand.offsets + 8e-3 * random.normal(size=(19, 3)))
     like = like.with_skeleton(DENSE.skeleton)
-    order = random.permutation(19)
-    names = [DENSE.markers[i] for i in order]
-    found = new_hand(like, names, true.markers[:, order], rate=RATE, name="mine")
-    assert found.name == "mine"
-    assert found.markers == DENSE.markers
+    found = calibrate(like, true.markers, rate=RATE, priors=Priors(offset=10e-3)).hand
     assert rms(found.offsets - true.hand.offsets) < 0.6 * rms(like.offsets - true.hand.offsets)
-    with pytest.raises(ValueError, match="names: expected those of dense19"):
-        new_hand(like, names[1:], true.markers[:, 1:])
 
 
 def test_what_is_wrong_is_named() -> None:
