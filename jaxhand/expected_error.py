@@ -19,7 +19,7 @@ import numpy as np
 from jaxhand import sequences as data
 from jaxhand import simulation, tracker
 from jaxhand.compiled import compiled
-from jaxhand.evaluation import BLOCK_SECONDS
+from jaxhand.evaluation import BLOCK_SECONDS, plain
 from numpy_infer.arrays import Array
 from numpy_infer.model import ERROR_CHANGES, Model
 from numpy_infer.pose import State
@@ -66,7 +66,9 @@ class Samples(NamedTuple):
 
 
 def measure(model: Model, sequences: Sequence[data.Sequence], seed: int = 0) -> Samples:
-    """Runs the tracker through gaps (`simulation.gaps`) in the sequences."""
+    """Runs the tracker, without gate and output filter, through gaps (`simulation.gaps`) in the
+    sequences."""
+    model = plain(model)
     truth, pieces = _pieces(sequences)
     frames, _, markers = truth.shape[:3]
     blocks = (np.arange(frames) / (data.RATE * BLOCK_SECONDS)).astype(int)

@@ -266,7 +266,8 @@ def joint_errors(model: Model, dataset: data.Dataset) -> dict[str, dict[str, Cel
 
 def evaluate_poses(model: Model, markers: Array) -> HandPose:
     """The tracker's output on complete frames `[N, M, 3]`, each as a first frame."""
-    model = replace(model, predictor="affine", joints="learned")  # alignment as the model has it
+    # Alignment as the model has it.
+    model = replace(evaluation.plain(model), predictor="affine", joints="learned")
     chunks, size = evaluation.chunked(len(markers))
     visible, dt = jnp.ones((size, len(model.hand)), bool), jnp.zeros(size)
     parts = []

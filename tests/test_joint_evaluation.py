@@ -215,6 +215,12 @@ def test_without_a_frame_that_is_known_there_is_no_table(dataset: Dataset, field
             measure(model, nothing)
 
 
+def test_poses_are_of_the_model_without_its_gate(dataset: Dataset) -> None:
+    model, markers = with_posture(dataset), dataset.sequences[0].markers[:4]
+    gated = evaluation.evaluate_poses(replace(model, gate=True), markers)
+    np.testing.assert_array_equal(gated.angles, evaluation.evaluate_poses(model, markers).angles)
+
+
 def test_without_joint_truth_there_is_no_table(dataset: Dataset) -> None:
     bare = replace(dataset, sequences=tuple(replace(s, positions=None) for s in dataset.sequences))
     model = replace(a_model("affine", dtype=np.float32), joints="none")
