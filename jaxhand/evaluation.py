@@ -88,7 +88,7 @@ def table3(
     """Marker error of each model, `{METHOD: {"1".."4": {"0.1".."2.0": CELL}}}`.
 
     Args:
-        models: name → model; all for the same markers.
+        models: name → model; all for the same markers. See `plain`.
         sequences: what to test on, at 60 Hz.
         seeds: how many times every start is taken, with other markers hidden.
         report: is told the method at work and the share of its trials done.
@@ -186,7 +186,7 @@ def table_of(
     """One method's part of a table, `{COUNT: {DURATION: CELL}}`.
 
     Args:
-        model: what runs until the gap begins.
+        model: what runs until the gap begins; without its gate and its output filter.
         starts: where to begin.
         seeds: how many times every start is taken.
         report: is told the share of the trials done.
@@ -226,8 +226,15 @@ def chunked(count: int) -> tuple[range, int]:
     return range(0, count, size), size
 
 
+def plain(model: Model) -> Model:
+    """The model without gate and output filter, the choices of whoever runs it that go by time:
+    trials leap over that, and nothing in them is measured wrongly."""
+    return replace(model, gate=False, smoothing=None)
+
+
 def _visible_until(model: Model, starts: Starts, size: int) -> Any:
     """The tracker's state `[size]` at each start, after 20 visible frames."""
+    model = plain(model)
     state = tracker.init(model, (size,))
     visible = jnp.ones((size, len(model.hand)), bool)
     for back in range(VISIBLE_BEFORE - 1, -1, -1):
@@ -258,7 +265,7 @@ def run_trials(
     size = len(state.tracked)
     truth = starts.frames[padded(last, size)]
     visible = ~padded(hidden, size)
-    _, pose = _step(model, state, truth, visible, jnp.full(size, duration))
+    _, pose = _step(plain(model), state, truth, visible, jnp.full(size, duration))
     fields = (None if f is None else np.asarray(f)[: len(last)][admissible] for f in pose)
     trials = Trials(hidden[admissible], last[admissible], HandPose(*fields))
     return trials, starts.block[admissible]

@@ -19,7 +19,7 @@ import numpy as np
 from jaxhand import sequences as data
 from jaxhand import simulation, tracker
 from jaxhand.compiled import compiled
-from jaxhand.evaluation import BLOCK_SECONDS
+from jaxhand.evaluation import BLOCK_SECONDS, plain
 from numpy_infer.arrays import Array
 from numpy_infer.model import ERROR_CHANGES, Model
 from numpy_infer.pose import State
@@ -62,14 +62,16 @@ class Samples(NamedTuple):
     measured: Array
     """Metres: what it was off."""
     block: Array
-    """Of the bootstrap: errors near in time are much the same, see `evaluation.BLOCK_SECONDS`."""
+    """Of the bootstrap: errors near in time are much the same, see `evaluation.BLOCK_SECONDS`, and
+    so may be those of both hands of a take."""
 
 
 def measure(model: Model, sequences: Sequence[data.Sequence], seed: int = 0) -> Samples:
-    """Runs the tracker through gaps (`simulation.gaps`) in the sequences."""
-    truth, pieces = _pieces(sequences)
-    frames, _, markers = truth.shape[:3]
-    blocks = (np.arange(frames) / (data.RATE * BLOCK_SECONDS)).astype(int)
+    """Runs the tracker, without gate and output filter, through gaps (`simulation.gaps`) in the
+    sequences."""
+    model = plain(model)
+    truth, blocks = _pieces(sequences)
+    frames, pieces, markers = truth.shape[:3]
     key, found = jax.random.key(seed), []
     for first in range(0, max(STREAMS, pieces), AT_ONCE):
         of = (np.arange(AT_ONCE) + first) % pieces
@@ -92,7 +94,7 @@ def measure(model: Model, sequences: Sequence[data.Sequence], seed: int = 0) -> 
                 (1 - np.exp(-change / model.fade)) * np.linalg.norm(correction[hidden], axis=-1),
                 expected[hidden],
                 np.linalg.norm(output[hidden] - points[hidden], axis=-1),
-                blocks[frame] * pieces + of[hand],
+                blocks[frame, of[hand]],
             )
         )
     return Samples(*(np.concatenate(field) for field in zip(*found, strict=True)))
@@ -112,18 +114,24 @@ def _run(model: Model, markers: Array, visible: Array) -> tuple[Array, ...]:
     return jax.lax.scan(frame, tracker.init(model, time.shape), (markers, visible))[1]
 
 
-def _pieces(sequences: Sequence[data.Sequence]) -> tuple[Array, int]:
-    """`[T, N, M, 3]` pieces of the sequences side by side, NaN after their ends; and how many."""
-    pieces = [
-        np.asarray(sequence.markers[first : first + PIECE], np.float32)
+def _pieces(sequences: Sequence[data.Sequence]) -> tuple[Array, Array]:
+    """`[T, N, M, 3]` pieces of the sequences side by side, NaN after their ends; and `[T, N]` the
+    bootstrap's block of each frame."""
+    parts = [
+        (sequence, first)
         for sequence in sequences
         for first in range(0, len(sequence.markers), PIECE)
     ]
+    pieces = [np.asarray(s.markers[first : first + PIECE], np.float32) for s, first in parts]
     longest = max(map(len, pieces))
     padded = np.full((longest, len(pieces), *pieces[0].shape[1:]), np.nan, np.float32)
     for i, piece in enumerate(pieces):
         padded[: len(piece), i] = piece
-    return padded, len(pieces)
+    number = {sequence.take: i for i, sequence in enumerate(sequences)}
+    take = np.array([number[sequence.take] for sequence, _ in parts])
+    frame = np.array([first for _, first in parts]) + np.arange(longest)[:, None]
+    block = (frame / (data.RATE * BLOCK_SECONDS)).astype(int)
+    return padded, block * len(sequences) + take
 
 
 class Expected(NamedTuple):

@@ -102,6 +102,10 @@ def step(
     Returns:
         The new state; `[..., M]` True where visible and accepted.
     """
+    if isinstance(model.hand.skeleton, jax.core.Tracer):
+        raise ValueError(
+            "a model with a gate cannot be an argument of what JAX compiles: close over it"
+        )
     moved = markers - state.markers
     off = moved - state.velocity * dt[..., None, None]
     off = off - off.sum(-2, keepdims=True) / markers.shape[-2]

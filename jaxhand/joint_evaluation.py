@@ -181,38 +181,42 @@ def wrist_errors(
     return result
 
 
-def steadiness(model: Model, dataset: data.Dataset, seed: int = 0) -> dict[str, float]:
+def steadiness(model: Model, dataset: data.Dataset, seed: int = 0) -> dict[str, float | None]:
     """How quiet the output is, in mm.
 
     Returns:
         `jitter`, `jitter_of_truth`: mean size of the third difference of the joints' positions from
-        frame to frame, nothing hidden, and the same of the truth. `still`: mean step of the joints
-        of a hand that stands still, with `STILL_NOISE` on its markers.
+        frame to frame, nothing hidden, and the same of the truth, over all four frames in a row
+        that have all markers and joint truth; None where there are none. `still`: mean step of the
+        joints of a hand that stands still, with `STILL_NOISE` on its markers.
+
+    Raises:
+        ValueError: no frame has all markers and joint truth.
     """
-    poses, truth = [], []
-    for sequence in dataset.sequences:
-        complete = np.isfinite(sequence.markers).all((-1, -2))
-        positions = sequence.positions
-        if positions is None or not np.isfinite(positions).all():
-            continue
-        if complete.all() and len(complete) > 3:
-            poses.append(evaluate_poses(model, sequence.markers).positions)
-            truth.append(positions)
+    frames = _known(dataset)
+    lengths = np.array([len(sequence.markers) + 1 for sequence in dataset.sequences])
+    place = (np.cumsum(lengths) - lengths)[frames.sequence] + frames.index
+    found: Array = evaluate_poses(model, frames.markers).positions
+    # Between sequences stands a frame that is none: no difference reaches across it.
+    whole = np.full((2, lengths.sum(), *found.shape[1:]), np.nan, np.float32)
+    whole[:, place] = found, frames.positions
+    jitter, of_truth = ([*off[np.isfinite(off)]] for off in map(_third, whole))
     rng = np.random.default_rng(seed)
     shape = (300, len(model.hand), 3)
-    still = dataset.sequences[0].markers[0] + STILL_NOISE * rng.standard_normal(shape)
+    still = frames.markers[0] + STILL_NOISE * rng.standard_normal(shape)
     held: Array = evaluate_poses(model, still.astype(np.float32)).positions
     return {
-        "jitter": float(np.mean([_third(p) for p in poses])),
-        "jitter_of_truth": float(np.mean([_third(p) for p in truth])),
+        "jitter": float(np.mean(jitter)) if jitter else None,
+        "jitter_of_truth": float(np.mean(of_truth)) if of_truth else None,
         "still": float(1e3 * np.linalg.norm(np.diff(held, axis=0), axis=-1)[:, POINTS].mean()),
     }
 
 
 def tip_distance_errors(model: Model, dataset: data.Dataset) -> Cell:
     """Mean error in mm of the distances from the thumb's tip to the other fingers' tips, in frames
-    where that is less than 3 cm: what decides whether a pinch looks like one. Nothing hidden."""
-    frames = data.complete_frames(dataset)
+    where that is less than 3 cm: what decides whether a pinch looks like one. Nothing hidden.
+    ValueError as `steadiness`."""
+    frames = _known(dataset)
     assert frames.positions is not None
     found = evaluate_poses(model, frames.markers).positions
     apart, wanted = _tip_distances(found), _tip_distances(frames.positions)
@@ -231,13 +235,14 @@ def joint_errors(model: Model, dataset: data.Dataset) -> dict[str, dict[str, Cel
     mean angles of its training data, whatever the markers say.
 
     Raises:
-        ValueError: the model has no joint network, or the data no joint truth.
+        ValueError: the model has no joint network, or no frame all markers and joint truth.
     """
     if model.joint_network is None:
         raise ValueError("the model has no joint network")
-    frames = data.complete_frames(dataset)
-    if frames.angles is None or frames.positions is None or frames.rotations is None:
-        raise ValueError(f"data set {dataset.name!r} has no joint truth")
+    frames = _known(dataset)
+    assert frames.positions is not None
+    assert frames.rotations is not None
+    assert frames.angles is not None
     observed = dataset.observed_angles
     observed = np.ones(frames.angles.shape[-1], bool) if observed is None else observed
     poses = evaluate_poses(model, frames.markers)
@@ -261,7 +266,8 @@ def joint_errors(model: Model, dataset: data.Dataset) -> dict[str, dict[str, Cel
 
 def evaluate_poses(model: Model, markers: Array) -> HandPose:
     """The tracker's output on complete frames `[N, M, 3]`, each as a first frame."""
-    model = replace(model, predictor="affine", joints="learned")  # alignment as the model has it
+    # Alignment as the model has it.
+    model = replace(evaluation.plain(model), predictor="affine", joints="learned")
     chunks, size = evaluation.chunked(len(markers))
     visible, dt = jnp.ones((size, len(model.hand)), bool), jnp.zeros(size)
     parts = []
@@ -300,10 +306,24 @@ def _interval_of(values: Array, blocks: Array) -> Cell:
     return interval(np.bincount(blocks, values), np.bincount(blocks))
 
 
-def _truth(dataset: data.Dataset) -> Array:
-    """`[F, 21, 3]` metres, all sequences end to end as in `Starts.frames`."""
-    if any(s.positions is None for s in dataset.sequences):
+def _known(dataset: data.Dataset) -> data.CompleteFrames:
+    """The frames with all markers and joint truth.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if any(s.positions is None or s.angles is None for s in dataset.sequences):
         raise ValueError(f"data set {dataset.name!r} has no joint truth")
+    frames = data.complete_frames(dataset)
+    if not len(frames.index):
+        raise ValueError(f"data set {dataset.name!r} has no frame with all markers and joint truth")
+    return frames
+
+
+def _truth(dataset: data.Dataset) -> Array:
+    """`[F, 21, 3]` metres, all sequences end to end as in `Starts.frames`. ValueError as
+    `_known`."""
+    _known(dataset)
     return np.concatenate([s.positions for s in dataset.sequences if s.positions is not None])
 
 
@@ -363,9 +383,10 @@ def _degrees(rotation: Array, truth: Array) -> Array:
     return np.degrees(np.arctan2(sine, cosine))
 
 
-def _third(positions: Array) -> float:
-    """Mean size of the third difference, mm."""
-    return float(1e3 * np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1)[:, POINTS].mean())
+def _third(positions: Array) -> Array:
+    """`[T - 3]` mean size of the third difference, mm."""
+    off = np.linalg.norm(np.diff(positions, 3, axis=0), axis=-1)[:, POINTS]
+    return np.asarray(1e3 * off.mean(-1))
 
 
 def _tip_distances(positions: Array) -> Array:

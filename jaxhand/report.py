@@ -163,10 +163,14 @@ def _joints_report(
             f"{_cell(cells['deg'])}°"
         )
     steadiness = result["steadiness_mm"]
+    jitter, of_truth = (
+        "–" if steadiness[name] is None else f"{steadiness[name]:.3f}"
+        for name in ("jitter", "jitter_of_truth")
+    )
     console.print(
-        f"third difference of the joints: {steadiness['jitter']:.3f} mm, of the truth "
-        f"{steadiness['jitter_of_truth']:.3f} mm; steps of a still hand with markers that are "
-        f"{1e3 * joint_evaluation.STILL_NOISE:g} mm noisy: {steadiness['still']:.2f} mm"
+        f"third difference of the joints: {jitter} mm, of the truth {of_truth} mm; steps of a "
+        f"still hand with markers that are {1e3 * joint_evaluation.STILL_NOISE:g} mm noisy: "
+        f"{steadiness['still']:.2f} mm"
     )
     console.print(
         f"distance of thumb tip and finger tips under 3 cm: off by "

@@ -37,7 +37,7 @@ from jaxhand.tasks import (
     marker_task,
     mean_square,
 )
-from jaxhand.training_data import check_frames, check_joint_frames, collect
+from jaxhand.training_data import check_frames, check_joint_frames, check_measured, collect
 from numpy_infer.arrays import Array
 from numpy_infer.hand import Hand
 from numpy_infer.model import Model
@@ -304,6 +304,8 @@ def fit_networks(
         training, validation = (x._replace(angles=None) for x in (training, validation))
     check_frames("training", training, hand, config.batch)
     check_frames("validation", validation, hand, 1)
+    if start is None or start.marker_network is None:
+        check_measured("training", training, hand)
     if joint_frames is None and training.angles is not None and validation.angles is not None:
         joint_frames = training, validation
     if joint_frames is not None:
@@ -349,7 +351,9 @@ def fit_networks(
         if math.isfinite(fit.plateau.best):
             networks[task.name] = jax.tree.map(np.asarray, replace(task.network, arrays=fit.best))
             error = float(task.measure(fit.best)[1]) * 100
-            summary[task.name] = {"epochs": fit.epoch, "validation_cm": error}
+            # It may be of nothing: where what would be hidden was never measured.
+            known = error if math.isfinite(error) else None
+            summary[task.name] = {"epochs": fit.epoch, "validation_cm": known}
         elif not summary["interrupted"]:
             raise ValueError(f"{task.name}: the loss is not finite; lower the learning rate")
         if summary["interrupted"]:

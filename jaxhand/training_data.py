@@ -186,6 +186,21 @@ def check_frames(what: str, frames: Frames, hand: Hand, least: int) -> None:
         raise ValueError(f"{what}: expected {least} or more frames, found {len(seen)}")
 
 
+def check_measured(what: str, frames: Frames, hand: Hand) -> None:
+    """Refuses frames that say nothing of a marker to a new marker network.
+
+    Raises:
+        ValueError: names the markers that no frame has.
+    """
+    never = ~np.isfinite(frames.markers).all(-1).any(0)
+    if never.any():
+        names = ", ".join(np.array(hand.markers)[never])
+        raise ValueError(
+            f"{what}: expected every marker in some frame, found {names} in none; a model that "
+            "knows them may be gone on from (--start)"
+        )
+
+
 def check_joint_frames(what: str, frames: Frames, hand: Hand, least: int) -> None:
     """Refuses frames of which fewer than `least` can teach a joint network anything.
 

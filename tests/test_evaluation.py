@@ -13,7 +13,7 @@ pytest.importorskip("jax")
 
 from rich.console import Console
 
-from jaxhand import evaluation, report
+from jaxhand import evaluation, expected_error, report
 from jaxhand.cli import evaluate
 from jaxhand.sequences import Sequence
 from jaxhand.training import TrainingConfig
@@ -22,6 +22,7 @@ from numpy_infer import tracker
 from numpy_infer.hand import load_hand
 from numpy_infer.model import Model
 from numpy_infer.networks import Dense, Network, array_shapes
+from numpy_infer.one_euro import Smoothing
 from numpy_infer.recordings import Recording, write
 
 HAND = load_hand("glove9")
@@ -73,6 +74,20 @@ def test_the_shortcut_equals_the_run_frame_by_frame(name: str) -> None:
         last = evaluation.VISIBLE_BEFORE + frames - 1
         _, short = tracker.step(model, jump, markers[last], visible[last], np.asarray(frames / 60))
         assert np.abs(short.markers - pose.markers).max() < 1e-6
+
+
+def test_what_a_model_is_run_with_live_is_not_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gate and output filter go by time, which trials leap over."""
+    monkeypatch.setattr(expected_error, "AT_ONCE", 16)
+    monkeypatch.setattr(expected_error, "STREAMS", 16)
+    live = replace(learned(), gate=True, smoothing=Smoothing())
+    sequences = [wriggling(60, 1)]
+    tables = evaluation.table3({"bare": learned(), "live": live}, sequences, seeds=1)
+    assert tables["bare"] == tables["live"]
+    one, other = (expected_error.measure(model, sequences) for model in (learned(), live))
+    assert len(one.measured)
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
 
 
 def test_starts_have_twenty_complete_frames_before_and_room_after() -> None:

@@ -74,6 +74,24 @@ def test_what_is_on_its_way_back_is_off_by_what_is_left_of_it(continuity: bool) 
     assert (off[40:, 0, 3] > 1e-3).any() == continuity
 
 
+def test_both_hands_of_a_take_share_their_blocks_of_four_seconds() -> None:
+    pytest.importorskip("jax")
+    from jaxhand.expected_error import PIECE, _pieces
+    from jaxhand.sequences import Sequence
+
+    def of(take: str, frames: int) -> Sequence:
+        return Sequence(take, take, 60.0, np.zeros((frames, 9, 3), np.float32))
+
+    # The first take's pieces are cut in the middle of a block.
+    sequences = [of("a", PIECE + 300), of("b", 50), of("a", PIECE + 300)]
+    truth, block = _pieces(sequences)
+    assert block.shape == truth.shape[:2] == (PIECE, 5)
+    left, right = (np.concatenate([block[:, i], block[:300, i + 1]]) for i in (0, 3))
+    np.testing.assert_array_equal(left, right)
+    assert (np.diff(left) != 0).nonzero()[0].tolist() == [239, 479, 719]
+    assert not set(block[:50, 2]) & set(left)
+
+
 def some_samples(seed: int) -> tuple[object, Array]:
     """Samples whose errors scatter about known means, and these."""
     from jaxhand.expected_error import Samples

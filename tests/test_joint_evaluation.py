@@ -164,12 +164,61 @@ def test_angles_between_rotations_are_right_near_none_and_near_half_a_turn() -> 
 def test_steadiness_and_tip_distances_are_of_the_output(dataset: Dataset) -> None:
     model = replace(with_posture(dataset), wearer=dataset.hand)
     quiet = evaluation.steadiness(model, dataset)
-    own = [evaluation._third(s.positions) for s in dataset.sequences]
+    own = [evaluation._third(s.positions).mean() for s in dataset.sequences]
     assert quiet["jitter_of_truth"] == pytest.approx(np.mean(own))
     assert quiet["still"] > 0.1
     cell = evaluation.tip_distance_errors(model, dataset)
     near = [(evaluation._tip_distances(s.positions) < 0.03).sum() for s in dataset.sequences]
     assert cell["n"] == sum(near)
+
+
+def holed(dataset: Dataset, field: str, frames: slice) -> Dataset:
+    """The data set with nothing known of some frames of both sequences."""
+    parts = [getattr(s, field).copy() for s in dataset.sequences]
+    for part in parts:
+        part[frames] = np.nan
+    sequences = [replace(s, **{field: p}) for s, p in zip(dataset.sequences, parts, strict=True)]
+    return replace(dataset, sequences=tuple(sequences))
+
+
+@pytest.mark.parametrize("field", ["markers", "positions"])
+def test_steadiness_is_that_of_the_frames_that_are_known(dataset: Dataset, field: str) -> None:
+    """Not of the template, which stands in for what is not."""
+    model = replace(with_posture(dataset), wearer=dataset.hand)
+    begins_later = evaluation.steadiness(model, holed(dataset, field, slice(1)))
+    shortened = [
+        replace(
+            s, **{f: getattr(s, f)[1:] for f in ("markers", "positions", "rotations", "angles")}
+        )
+        for s in dataset.sequences
+    ]
+    assert begins_later == evaluation.steadiness(model, replace(dataset, sequences=shortened))
+    between = evaluation.steadiness(model, holed(dataset, field, slice(30, 31)))
+    own = [evaluation._third(s.positions) for s in dataset.sequences]
+    kept = np.r_[:27, 31:67]
+    assert between["jitter_of_truth"] == pytest.approx(np.mean([part[kept] for part in own]))
+    few = evaluation.steadiness(model, holed(dataset, field, slice(None, None, 4)))
+    assert few["jitter"] is few["jitter_of_truth"] is None
+    assert few["still"] > 0.1
+
+
+@pytest.mark.parametrize("field", ["markers", "positions", "angles"])
+def test_without_a_frame_that_is_known_there_is_no_table(dataset: Dataset, field: str) -> None:
+    model, nothing = with_posture(dataset), holed(dataset, field, slice(None))
+    for measure in (
+        evaluation.joint_errors,
+        evaluation.steadiness,
+        evaluation.tip_distance_errors,
+        lambda model, dataset: evaluation.table4({"any": Row(model)}, dataset),
+    ):
+        with pytest.raises(ValueError, match="no frame with all markers and joint truth"):
+            measure(model, nothing)
+
+
+def test_poses_are_of_the_model_without_its_gate(dataset: Dataset) -> None:
+    model, markers = with_posture(dataset), dataset.sequences[0].markers[:4]
+    gated = evaluation.evaluate_poses(replace(model, gate=True), markers)
+    np.testing.assert_array_equal(gated.angles, evaluation.evaluate_poses(model, markers).angles)
 
 
 def test_without_joint_truth_there_is_no_table(dataset: Dataset) -> None:
