@@ -495,14 +495,3 @@ def test_where_nothing_is_refused_the_gate_changes_no_bit() -> None:
     what = asked(calm(a_model("learned").hand, 1))
     for one, other in zip(gated(what, True, False), gated(what, False, False), strict=True):
         assert_array_equal(one, other)
-
-
-def test_in_jax_a_gate_is_told_its_hand_before_it_is_compiled() -> None:
-    jax = pytest.importorskip("jax")
-    from jaxhand import tracker as twin
-
-    model = a_model("learned", dtype=np.float32, gate=True)
-    frame = np.zeros((9, 3), np.float32), np.ones(9, bool), np.float32(1)
-    with pytest.raises(ValueError, match="close over it"):
-        jax.jit(twin.step)(model, twin.init(model), *frame)
-    assert jax.jit(lambda state: twin.step(model, state, *frame)[1])(twin.init(model))

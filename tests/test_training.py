@@ -441,33 +441,6 @@ def test_what_was_not_measured_teaches_nothing() -> None:
     assert np.isfinite(slope).all()
 
 
-@pytest.mark.parametrize("simulated", [0.0, 0.5])
-def test_a_marker_that_no_frame_has_is_refused_before_anything_is_trained(simulated: float) -> None:
-    """And goes on as it was in a model that knows it."""
-    lacking = np.array(TRAINING.markers)
-    lacking[:, [4, 7]] = np.nan
-    frames, short = Frames(lacking, simulated=simulated), replace(CONFIG, joints=False, epochs=1)
-    trained: list[Any] = []
-    names = f"{HAND.markers[4]}, {HAND.markers[7]} in none"
-    with pytest.raises(ValueError, match=f"training: expected every marker .* {names}"):
-        fit_networks(frames, VALIDATION, HAND, short, trained.append)
-    assert not trained
-    first = fit_networks(TRAINING, VALIDATION, HAND, short)
-    assert fit_networks(frames, VALIDATION, HAND, short, start=first).marker_network
-
-
-def test_a_validation_that_has_nothing_to_hide_costs_no_model(tmp_path: Path) -> None:
-    seen = np.ones((len(TRAINING.markers), 9), bool)
-    seen[:, 4] = False
-    save({"one hand": statistics(HAND.markers, 60.0, [seen])}, tmp_path / "gaps.json")
-    lacking = np.array(VALIDATION.markers)
-    lacking[:, 4] = np.nan
-    config = replace(CONFIG, occlusions=str(tmp_path / "gaps.json"), joints=False, epochs=1)
-    model = fit_networks(TRAINING, Frames(lacking), HAND, config)
-    assert model.training["marker_network"]["validation_cm"] is None
-    model_file.save(model, tmp_path / "model.npz")
-
-
 def test_simulated_frames_are_others_in_every_epoch_and_as_many_as_asked() -> None:
     frames = TRAINING._replace(simulated=0.4)
     args = VALIDATION, HAND, jax.random.key(0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,10 @@ from small_training import (
 
 from jaxhand import training, training_data
 from jaxhand.datasets import parse_spec
+from jaxhand.occlusions import save, statistics
 from jaxhand.tasks import Frames
 from jaxhand.training import fit_networks
+from numpy_infer import model as model_file
 from numpy_infer.hand import load_hand
 
 
@@ -184,3 +187,30 @@ def test_a_frame_with_too_little_to_see_is_left_out() -> None:
     found = training_data.gather([make_dataset("a", Frames(frames), 1.0, None)])
     np.testing.assert_array_equal(found.markers, np.delete(frames, 3, 0))
     assert fit_networks(found, VALIDATION, HAND, replace(CONFIG, joints=False)).marker_network
+
+
+@pytest.mark.parametrize("simulated", [0.0, 0.5])
+def test_a_marker_that_no_frame_has_is_refused_before_anything_is_trained(simulated: float) -> None:
+    """And goes on as it was in a model that knows it."""
+    lacking = np.array(TRAINING.markers)
+    lacking[:, [4, 7]] = np.nan
+    frames, short = Frames(lacking, simulated=simulated), replace(CONFIG, joints=False, epochs=1)
+    trained: list[Any] = []
+    names = f"{HAND.markers[4]}, {HAND.markers[7]} in none"
+    with pytest.raises(ValueError, match=f"training: expected every marker .* {names}"):
+        fit_networks(frames, VALIDATION, HAND, short, trained.append)
+    assert not trained
+    first = fit_networks(TRAINING, VALIDATION, HAND, short)
+    assert fit_networks(frames, VALIDATION, HAND, short, start=first).marker_network
+
+
+def test_a_validation_that_has_nothing_to_hide_costs_no_model(tmp_path: Path) -> None:
+    seen = np.ones((len(TRAINING.markers), 9), bool)
+    seen[:, 4] = False
+    save({"one hand": statistics(HAND.markers, 60.0, [seen])}, tmp_path / "gaps.json")
+    lacking = np.array(VALIDATION.markers)
+    lacking[:, 4] = np.nan
+    config = replace(CONFIG, occlusions=str(tmp_path / "gaps.json"), joints=False, epochs=1)
+    model = fit_networks(TRAINING, Frames(lacking), HAND, config)
+    assert model.training["marker_network"]["validation_cm"] is None
+    model_file.save(model, tmp_path / "model.npz")
