@@ -32,6 +32,12 @@ POINTS = np.array(JOINT_POINTS)
 
 TIPS = np.array([chain[-1] for chain in CHAINS])
 
+ROWS = (
+    *("ik", "ik_tuned", "least_squares", "learned", "learned_unaligned", "learned_uncalibrated"),
+    "noise_floor",
+)
+"""Names in Table 4 that are taken, see `rows` and `noise_floor_row`."""
+
 SOLVED_EVERY = 10
 """A solver takes every tenth start, once: it is a thousand times slower than a network."""
 
@@ -67,7 +73,7 @@ def rows(
     Args:
         model: with both networks.
         dataset: whose hand is taken.
-        others: further models by the name of their row.
+        others: further models by the name of their row, none of `ROWS`.
     """
     wearer = dataset.hand
     uncalibrated = replace(model, predictor="learned", joints="learned", alignment=True)

@@ -281,7 +281,12 @@ def check_return(
 
 
 def check_batch(
-    tracker: Tracker, stream: Stream, right: Array | None = None, *, metres: float = METRES
+    tracker: Tracker,
+    stream: Stream,
+    right: Array | None = None,
+    *,
+    metres: float = METRES,
+    radians: float = RADIANS,
 ) -> None:
     """Any number of hands equals one at a time, left and right mixed.
 
@@ -289,7 +294,7 @@ def check_batch(
         tracker: what is checked; `init` takes the leading shape.
         stream: `[T, H, ...]` of several hands.
         right: `[H]` True for a right hand; by default every other one.
-        metres: tolerance, also of rotations and angles.
+        metres, radians: tolerances; a network's products are rounded otherwise in a batch.
     """
     hands = stream.visible.shape[1]
     right = np.arange(hands) % 2 == 1 if right is None else right
@@ -304,7 +309,9 @@ def check_batch(
             {k: v[:, hand] for k, v in together.items()},
             {k: v[:, 0, hand] for k, v in square.items()},
         ):
-            trial.same(many, one, within=metres)
+            trial.same(many, one, ("state", "status", "notice"))
+            trial.same(many, one, (*PLACES, "expected_error"), within=metres)
+            trial.same(many, one, ("angles", *TURNS), within=radians)
             for name, value in one.items():
                 if many[name].dtype != value.dtype:
                     trial.refuse(f"{name}: {many[name].dtype} instead of {value.dtype}")

@@ -84,6 +84,9 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
         raise ValueError(f"expected one --data, found {len(config.data)}: each gets its own table")
     named = config.model is not None and config.model not in BASELINES
     model = load_model(str(config.model)) if named else None
+    if config.table == 4 and config.model is not None:
+        _check_joints("Table 4", model)
+    others = _others(config, model)
     hand = model.hand if model else None
     truth = config.truth or config.table == 4
     dataset = load(
@@ -102,7 +105,7 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
         console.print(f"the bundled model {dataset.hand.name}, which has seen simulated hands only")
     model = model or Model(dataset.hand, predictor=str(config.model))
     if config.table == 4:
-        result = _joints_report(model, dataset, config, console)
+        result = _joints_report(model, others, dataset, config, console)
     else:
         result = _markers_report(model, dataset, config, console)
     if config.json is not None:
@@ -138,12 +141,37 @@ def _markers_report(
     return result
 
 
+def _check_joints(what: str, model: Model | None) -> None:
+    if model is None or model.marker_network is None or model.joint_network is None:
+        raise ValueError(f"{what} needs a model with both networks")
+
+
+def _others(config: EvaluationConfig, model: Model | None) -> dict[str, Model]:
+    """The models of `--also`; looked at before the data, which may take minutes.
+
+    Raises:
+        ValueError: what would be no row of its own.
+    """
+    if config.also and config.table != 4:
+        raise ValueError("also: further rows are for --table 4")
+    others: dict[str, Model] = {}
+    for name, path in map(_named, config.also):
+        if name in others or name in joint_evaluation.ROWS:
+            raise ValueError(f"also: a row {name!r} is there already")
+        others[name] = load_model(path)
+        _check_joints(f"also {name}: Table 4", others[name])
+        if model is not None and others[name].hand.markers != model.hand.markers:
+            raise ValueError(f"also {name}: a model for other markers than {config.model}")
+    return others
+
+
 def _joints_report(
-    model: Model, dataset: Dataset, config: EvaluationConfig, console: Console
+    model: Model,
+    others: Mapping[str, Model],
+    dataset: Dataset,
+    config: EvaluationConfig,
+    console: Console,
 ) -> dict[str, Any]:
-    if model.marker_network is None or model.joint_network is None:
-        raise ValueError("Table 4 needs a model with both networks")
-    others = {name: load_model(path) for name, path in map(_named, config.also)}
     rows = joint_evaluation.rows(model, dataset, others)
     with _bars(list(rows), console) as report:
         table = joint_evaluation.table4(rows, dataset, seeds=config.seeds, report=report)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +17,12 @@ from streams import a_model
 from jaxhand import joint_evaluation as evaluation
 from jaxhand import report
 from jaxhand.joint_evaluation import Row
+from jaxhand.report import EvaluationConfig
 from jaxhand.sequences import Dataset, Sequence
 from jaxhand.sparse_fit import prior_of
 from numpy_infer import load_hand, tracker
 from numpy_infer.arrays import Array
+from numpy_infer.model import load, save
 
 GLOVE = load_hand("glove9")
 FRAMES, LARGER = 70, 1.1
@@ -219,6 +222,35 @@ def test_poses_are_of_the_model_without_its_gate(dataset: Dataset) -> None:
     model, markers = with_posture(dataset), dataset.sequences[0].markers[:4]
     gated = evaluation.evaluate_poses(replace(model, gate=True), markers)
     np.testing.assert_array_equal(gated.angles, evaluation.evaluate_poses(model, markers).angles)
+
+
+@pytest.mark.parametrize(
+    ("said", "message"),
+    [
+        ({"model": "affine"}, "Table 4 needs a model with both networks"),
+        ({"model": "BARE"}, "Table 4 needs a model with both networks"),
+        ({"also": ("mine=BARE",)}, "also mine: Table 4 needs a model with both networks"),
+        ({"also": ("mine=dense19",)}, "also mine: a model for other markers than glove9"),
+        ({"also": ("learned=glove9",)}, "a row 'learned' is there already"),
+        ({"also": ("mine=glove9", "mine=glove9")}, "a row 'mine' is there already"),
+        ({"also": ("mine=glove9",), "table": 3}, "are for --table 4"),
+    ],
+)
+def test_what_would_be_no_row_of_its_own_is_refused_before_the_data_are_read(
+    said: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    bare = tmp_path / "bare.npz"
+    save(replace(load("glove9"), joints="none", joint_network=None), bare)
+    told = {k: str(bare) if v == "BARE" else v for k, v in {"model": "glove9", **said}.items()}
+    if "also" in told:
+        told["also"] = tuple(text.replace("BARE", str(bare)) for text in told["also"])
+    with pytest.raises(ValueError, match=message):
+        report.evaluate(EvaluationConfig(("nowhere:no",), **{"table": 4, **told}))
+
+
+def test_rows_have_the_names_that_are_taken(dataset: Dataset) -> None:
+    taken = {*evaluation.rows(with_posture(dataset), dataset), "noise_floor"}
+    assert taken == set(evaluation.ROWS)
 
 
 def test_without_joint_truth_there_is_no_table(dataset: Dataset) -> None:

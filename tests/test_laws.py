@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -162,6 +163,16 @@ def test_a_broken_tracker_is_caught_by_marker_and_frame_in_few_frames(
     if law != "return":
         hiding = re.findall(r"frames? [\d-]+: ([a-z0-9_ ]+) hidden", said)
         assert {len(names.split()) for names in hiding} == ({hidden} if hidden else set()), said
+
+
+@pytest.mark.parametrize(("degrees", "caught"), [(0.004, False), (0.02, True)])
+def test_a_batch_may_turn_a_hand_by_a_tenth_of_a_milliradian(degrees: float, caught: bool) -> None:
+    def in_company(pose: Any, state: Any, markers: Array, visible: Array) -> None:
+        if visible.ndim > 1:
+            pose.wrist_rotation[...] = pose.wrist_rotation @ turn((1, 2, 3), np.radians(degrees))
+
+    with pytest.raises(AssertionError, match=r"batch.* rad") if caught else nullcontext():
+        laws.check_all(Broken(in_company), laws=["batch"], examples=5, seed=0)
 
 
 def test_a_path_that_sees_the_future_is_caught() -> None:
