@@ -182,13 +182,13 @@ def marker_task(
 
 
 def _new_marker_network(markers: Array, hand: Hand, key: Array, hidden: Spec) -> Network:
-    seen = jnp.isfinite(markers).all(-1)
+    seen, template = jnp.isfinite(markers).all(-1), jnp.asarray(hand.template, jnp.float32)
     registered = register(
-        jnp.asarray(hand.template, jnp.float32),
-        jnp.where(seen[..., None], markers, 0),
-        seen.astype(markers.dtype),
+        template, jnp.where(seen[..., None], markers, 0), seen.astype(markers.dtype)
     )
+    # A marker that no frame has is simulated, about where the hand has it.
     mean = registered.mean(0, where=seen[..., None])
+    mean = jnp.where(seen.any(0)[:, None], mean, template)
     scale = (registered - mean).std(where=seen[..., None])
     return _untrained(hidden, mean.ravel(), scale, mean.ravel(), scale, key)
 

@@ -304,7 +304,7 @@ def fit_networks(
         training, validation = (x._replace(angles=None) for x in (training, validation))
     check_frames("training", training, hand, config.batch)
     check_frames("validation", validation, hand, 1)
-    if start is None or start.marker_network is None:
+    if not training.simulated and (start is None or start.marker_network is None):
         check_measured("training", training, hand)
     if joint_frames is None and training.angles is not None and validation.angles is not None:
         joint_frames = training, validation
