@@ -195,7 +195,8 @@ def read(
     unit: metres per unit of the file, for files that do not say (BVH, bare CSV).
     left_handed: the file's frame is left-handed; z is negated. The authors' CSV always is, and
         needs no telling.
-    label_map: {label in the file: our name}; other labels only lose a prefix such as `Subject:`.
+    label_map: {label in the file: our name}; other labels only lose a prefix such as `Subject:`,
+        and keep it where it alone tells them apart, as those of two hands.
     format: a reader's name, where the suffix and the first line would pick another.
 
     Raises ValueError, with file and line, for whatever is wrong inside the file; nothing is
@@ -309,11 +310,15 @@ def _csv_format(path: Path) -> str:
 
 
 def _relabelled(recording: Recording, label_map: Mapping[str, str]) -> Recording:
-    """Our names for mapped labels; the others without their `Subject:` prefix."""
+    """Our names for mapped labels; the others without their `Subject:` prefix, unless two of them
+    would then be one."""
     bare = {label: _without_prefix(label) for label in recording.names}
     there = dict.fromkeys((*bare, *bare.values()))
     _check_known(label_map, there, f"{recording.source}: label map: ")
-    names = {label: label_map.get(label, label_map.get(bare[label], bare[label])) for label in bare}
+    mapped = {label: label_map.get(label, label_map.get(bare[label])) for label in bare}
+    left = [bare[label] for label, name in mapped.items() if name is None]
+    kept = dict(zip(bare, bare, strict=True)) if len(set(left)) < len(left) else bare
+    names = {label: kept[label] if name is None else name for label, name in mapped.items()}
     by_name: dict[str, str] = {}
     for label, name in names.items():
         if name in by_name:

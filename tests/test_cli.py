@@ -347,6 +347,22 @@ def test_prefixes_of_two_hands_are_pointed_out(
     assert begun in refused(["track", "both.csv", "--model", "glove9", "-o", "out.csv"], capsys)
 
 
+def test_two_subjects_of_one_file_are_two_hands(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = read(take)
+    names = [prefix + name for prefix in ("L_", "R_") for name in HAND.markers]
+    both = np.concatenate([whole.markers, whole.markers], 1)
+    write(replace(whole, names=names, markers=both, filled=()), tmp_path / "both.csv")
+    text = (tmp_path / "both.csv").read_text()
+    (tmp_path / "both.csv").write_text(text.replace("L_", "Left:").replace("R_", "Right:"))
+    options = ["--left-prefix", "Left:", "--right-prefix", "Right:"]
+    assert f"see {' '.join(options)}\n" in refused(["track", "both.csv", "-o", "out.csv"], capsys)
+    assert main(["track", "both.csv", "-o", "out.csv", *options]) == 0
+    assert main(["track", take, "-o", "one.csv"]) == 0
+    assert (tmp_path / "out_left.csv").read_text() == (tmp_path / "one.csv").read_text()
+
+
 def test_too_few_labels_are_refused_with_what_is_lacking(
     take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

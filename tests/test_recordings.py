@@ -308,11 +308,12 @@ def test_prefixes_are_stripped_and_labels_mapped(tmp_path: Path) -> None:
         read(path, label_map={"Foot:a": "thumb"})
 
 
-def test_prefixes_that_alone_tell_labels_apart_need_a_label_map(tmp_path: Path) -> None:
-    path = csv_with(tmp_path / "take.csv", "Left:a", "Right:a")
-    with pytest.raises(ValueError, match="duplicate marker name 'a', from 'Left:a' and 'Right:a'"):
-        read(path)
-    assert read(path, label_map={"Right:a": "other"}).names == ("a", "other")
+def test_prefixes_that_alone_tell_labels_apart_are_kept(tmp_path: Path) -> None:
+    path = csv_with(tmp_path / "take.csv", "Left:a", "Right:a", "Right:b", "c")
+    assert read(path).names == ("Left:a", "Right:a", "Right:b", "c")
+    assert read(path, label_map={"Right:a": "other"}).names == ("a", "other", "b", "c")
+    with pytest.raises(ValueError, match="duplicate marker name 'x', from 'Left:a' and 'Right:a'"):
+        read(path, label_map={"a": "x"})
 
 
 def test_writing_replaces_a_file_only_when_told(tmp_path: Path) -> None:
