@@ -282,7 +282,7 @@ def _track(options: argparse.Namespace) -> None:
     recording = _read(options)
     prefixes = {"left": options.left_prefix or "", "right": options.right_prefix or ""}
     labels = [labels_of(recording, prefixes[side]) for side in outputs]
-    model = _model(options, labels[0])
+    model = _model(options, labels[0], prefixes[next(iter(outputs))])
     if options.predictor:
         model = replace(model, predictor=options.predictor)
     if options.joints:
@@ -388,9 +388,9 @@ def _strain(angles: Array) -> float:
     return float(np.degrees(np.maximum(LOW - usual, usual - HIGH)[_KNUCKLES].max()))
 
 
-def _model(options: argparse.Namespace, labels: Sequence[str]) -> Model:
+def _model(options: argparse.Namespace, labels: Sequence[str], prefix: str) -> Model:
     if options.model in BASELINES:
-        hand = load_hand(options.hand) if options.hand else _fitting(labels, "--hand FILE")
+        hand = load_hand(options.hand) if options.hand else _fitting(labels, "--hand FILE", prefix)
         return Model(hand, predictor=options.model)
     if options.hand:
         raise ValueError(
@@ -399,17 +399,18 @@ def _model(options: argparse.Namespace, labels: Sequence[str]) -> Model:
         )
     if options.model:
         return load(options.model)
-    name = _fitting(labels, "--model FILE, or a baseline: --model affine --hand FILE").name
+    instead = "--model FILE, or a baseline: --model affine --hand FILE"
+    name = _fitting(labels, instead, prefix).name
     if name not in bundled_models():
         raise ValueError(f"no model is bundled for {name}: name one with --model")
     print(f"tracked by the bundled model {name}")
     return load(name)
 
 
-def _fitting(labels: Sequence[str], instead: str) -> Hand:
+def _fitting(labels: Sequence[str], instead: str, prefix: str) -> Hand:
     hand = fitting_hand(labels)
     if hand is None:
-        raise ValueError(unfitting(labels, instead))
+        raise ValueError(unfitting(labels, instead, prefix))
     return hand
 
 

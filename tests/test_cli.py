@@ -345,6 +345,8 @@ def test_prefixes_of_two_hands_are_pointed_out(
     assert "1000 times too large" in printed, "the left one is looked at, too"
     assert begun in refused(["track", "both.csv", "-o", "out.csv"], capsys)
     assert begun in refused(["track", "both.csv", "--model", "glove9", "-o", "out.csv"], capsys)
+    short = refused(["track", "both.csv", "--left-prefix", "L", "-o", "out.csv"], capsys)
+    assert short.endswith("labels of a hand begin with L_: see --left-prefix L_\n")
 
 
 def test_two_subjects_of_one_file_are_two_hands(

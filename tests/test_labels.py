@@ -26,6 +26,7 @@ from numpy_infer.labels import (
     meant,
     prefixed,
     tracked_without,
+    unfitting,
 )
 from numpy_infer.recordings import Recording, load_label_map, read
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
@@ -150,8 +151,27 @@ def test_what_the_labels_of_a_hand_begin_with_is_found(
     if prefixes[0][0] in sides:
         options = [f"--{sides[prefix[0]]}-prefix {quote(prefix)}" for prefix in prefixes]
         assert told.endswith(f"see {' '.join(options)}")
+    else:
+        assert told.endswith("see --left-prefix and --right-prefix")
     assert not beginnings(hand.markers)
     assert not beginnings([f"L_{name}" for name in hand.markers[:3]])
+
+
+def test_one_hand_of_an_unknown_side_may_be_either() -> None:
+    (told,) = advice([f"Bob {name}" for name in GLOVE.markers])
+    assert told.endswith("see --left-prefix 'Bob ' or --right-prefix 'Bob '")
+
+
+@pytest.mark.parametrize("begun", ["L", "L_h"])
+def test_a_prefix_that_is_cut_short_is_made_whole(begun: str) -> None:
+    rest = "L_hand_".removeprefix(begun)
+    labels = [rest + name for name in GLOVE.markers]
+    whole = begun + rest
+    told = unfitting(labels, "--model FILE", begun)
+    assert f"no bundled hand fits the labels {whole}{GLOVE.markers[0]}, " in told
+    assert told.endswith(f"labels of a hand begin with {whole}: see --left-prefix {whole}")
+    absent = ", ".join(begun + name for name in GLOVE.markers[5:])
+    assert f"; glove9 lacks {absent}" in unfitting(GLOVE.markers[:5], "--model FILE", begun)
 
 
 def test_a_label_map_is_read_from_json(tmp_path: Path) -> None:
