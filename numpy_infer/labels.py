@@ -235,10 +235,11 @@ def doubted_unit(recording: Recording, hand: Hand) -> str | None:
     if power == 0:
         return None
     much = "large" if power > 0 else "small"
+    # Of an inch no tenth is a unit: the power of ten nearest to what would do.
+    likely = 10.0 ** round(log10(recording.unit / np.median(known)))
     return (
         f"the markers are {10 ** abs(power)} times too {much} for a hand: is the unit, "
-        f"{recording.unit:g} m by the file or by --unit, right? {recording.unit / 10**power:g} m "
-        "would do"
+        f"{recording.unit:g} m by the file or by --unit, right? {likely:g} m would do"
     )
 
 

@@ -275,6 +275,17 @@ def test_a_unit_that_is_wrong_by_tens_is_doubted_and_the_right_one_named(
     assert told.endswith(f" {0.01 / 10**power:g} m would do")
 
 
+@given(hands, st.sampled_from([0.0254, 0.3048]), st.sampled_from([1e-3, 1e-4]), st.integers(0, 99))
+def test_the_unit_that_would_do_is_metric(
+    hand: Hand, wrong: float, right: float, seed: int
+) -> None:
+    markers = wrong / right * postures(hand, seed)
+    file = replace(recording(hand.markers, markers), unit=wrong)
+    told = doubted_unit(file, hand)
+    assert told is not None
+    assert told.endswith(f" {right:g} m would do")
+
+
 def test_what_is_not_seen_has_no_size() -> None:
     nothing = np.full((3, 9, 3), np.nan)
     assert doubted_unit(recording(GLOVE.markers, nothing), GLOVE) is None

@@ -205,7 +205,8 @@ def test_units_may_be_confirmed_but_not_contradicted(
     write(small(), path)
     stated = 1.0 if suffix == ".csv" else 1e-3
     assert_same(read(path, unit=stated), read(path), 0.0)
-    with pytest.raises(ValueError, match=r"take.*unit=0\.01"):
+    told = rf"take.* states {stated:g} m as its unit, and 0\.01 m was given: .*, correct it there"
+    with pytest.raises(ValueError, match=told):
         read(path, unit=0.01)
 
 
