@@ -32,7 +32,14 @@ from numpy_infer.model import bundled as bundled_models
 from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import Notice, Status, TrackingState
 from numpy_infer.predictors import BASELINES, PREDICTORS
-from numpy_infer.recordings import Recording, load_label_map, read, write, writer_of
+from numpy_infer.recordings import (
+    Recording,
+    doubted_time,
+    load_label_map,
+    read,
+    write,
+    writer_of,
+)
 from numpy_infer.tracking import Tracked, as_measured, track, track_hands
 
 STRAINED = 8.0
@@ -308,6 +315,8 @@ def _track(options: argparse.Namespace) -> None:
     for hand in hands:
         if doubt := doubted_unit(hand, model.body):
             raise ValueError(f"{options.file}: {doubt}")
+    if told := doubted_time(recording):
+        print(f"jaxhand track: {told}", file=sys.stderr)
     if len(hands) == 1:
         results = [track(hands[0], model, right="right" in outputs, report=report)]
     else:

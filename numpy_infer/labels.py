@@ -15,7 +15,7 @@ from numpy_infer.arrays import Array
 from numpy_infer.geometry import second_extent
 from numpy_infer.hand import Hand, bundled, load_hand
 from numpy_infer.pose import DETERMINED_EXTENT
-from numpy_infer.recordings import Recording
+from numpy_infer.recordings import Recording, doubted_time
 
 DISPENSABLE = 1 / 3
 """Share of a hand's markers that a file may have no label of. With so many never seen, the bundled
@@ -200,7 +200,7 @@ def without(hand: Hand, labels: Collection[str], prefix: str = "") -> str | None
 
 
 def doubts(recording: Recording) -> list[str]:
-    """What `jaxhand inspect` has to say of a recording's labels, and of its hands' size."""
+    """What `jaxhand inspect` has to say of a recording's labels, its hands' size and its time."""
     labels = recording.names
     begun, hand = beginnings(labels), fitting_hand(labels)
     found = [*begun.items(), *([("", hand)] if hand else [])]
@@ -208,7 +208,7 @@ def doubts(recording: Recording) -> list[str]:
     if not begun or hand:
         said += advice(labels, hand)
     sizes = [doubted_unit(prefixed(recording, *one), one[1]) for one in found]
-    return [*said, *dict.fromkeys(filter(None, sizes))]
+    return [*said, *dict.fromkeys(filter(None, [*sizes, doubted_time(recording)]))]
 
 
 def _by_fit(labels: Collection[str]) -> list[Hand]:

@@ -28,6 +28,10 @@ BUILT_IN = {
 READER_OF = {".trc": "trc", ".tsv": "qualisys", ".bvh": "bvh"}  # `.csv` is told by its first line
 WRITER_OF = {".trc": "trc", ".tsv": "qualisys", ".csv": "plain_csv"}
 
+SLOWEST = 5.0
+"""Hz: nobody records hands at less, but in a file whose time is in milliseconds or counts frames it
+looks like that."""
+
 # diag(1, 1, −1): a left-handed frame's coordinates in the right-handed frame that shares x and y
 _REFLECT_Z = np.array([1.0, 1.0, -1.0])
 
@@ -258,6 +262,18 @@ def median_rate(time: np.ndarray, source: object) -> float:
     if (np.abs(steps * median - 1) < 0.5).all():
         return float(len(steps) / (time[-1] - time[0]))
     return float(median)
+
+
+def doubted_time(recording: Recording) -> str | None:
+    """What is to be said of a recording whose frames are too far apart for seconds; or None."""
+    steps = np.diff(recording.time)
+    step = float(np.median(steps)) if steps.size else 0.0
+    if step <= 1 / SLOWEST:
+        return None
+    return (
+        f"the frames are {step:.3g} s apart: is the file's time in milliseconds, or does it count "
+        "frames? Seconds are expected"
+    )
 
 
 def _reader(path: Path, format: str | None) -> ModuleType:

@@ -414,6 +414,20 @@ def test_a_wrong_unit_is_told_of_and_not_tracked(
     assert refusal.count("\n") == bool(said)
 
 
+@pytest.mark.parametrize("verb", [["inspect"], ["track", "-o", "out.csv"]])
+@pytest.mark.parametrize(("hertz", "said"), [(0.06, True), (1, True), (10, False), (1e3, False)])
+def test_a_time_that_cannot_be_in_seconds_is_told_of(
+    verb: list[str], hertz: float, said: bool, take: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In milliseconds, or frame numbers, also where the file states a rate."""
+    recording = read(take)
+    write(replace(recording, time=np.arange(30) / hertz), Path(take), overwrite=True)
+    assert main([verb[0], take, *verb[1:]]) == 0
+    told = "".join(capsys.readouterr())
+    assert (f"the frames are {1 / hertz:.3g} s apart: is the file's time in mill" in told) == said
+    assert ("s apart" in told) == said
+
+
 @pytest.mark.parametrize("verb", [["inspect"], ["track", "-o", "out.csv", "--overwrite"]])
 def test_a_unit_may_be_named(
     verb: list[str], take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
