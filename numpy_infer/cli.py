@@ -366,6 +366,12 @@ def _summary(result: Tracked) -> str:
         lines.append(
             f"{100 * far.mean():6.2f} % of the frames have a marker over a metre from the others"
         )
+    late = (result.notice & Notice.NON_POSITIVE_DT) > 0
+    if late.any():
+        lines.append(
+            f"{100 * late.mean():6.2f} % of the frames come no later than the one before: is the "
+            "file's time in order?"
+        )
     # What to expect was measured of markers that had been seen.
     seen = np.logical_or.accumulate(status == Status.OBSERVED)
     hidden = seen & ((status == Status.PREDICTED) | (status == Status.REJECTED))

@@ -428,6 +428,19 @@ def test_a_time_that_cannot_be_in_seconds_is_told_of(
     assert ("s apart" in told) == said
 
 
+@pytest.mark.parametrize("order", [(3, 4), (4, 3), (3, 3)], ids=str)
+def test_frames_that_are_not_in_order_are_told_of(
+    order: tuple[int, int], take: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read(take)
+    time = recording.time.copy()
+    time[[3, 4]] = time[list(order)]
+    write(replace(recording, time=time), Path(take), overwrite=True)
+    assert main(["track", take, "-o", "out.csv"]) == 0
+    told = f"{100 / 30:6.2f} % of the frames come no later than the one before"
+    assert (told in capsys.readouterr().out) == (order != (3, 4))
+
+
 @pytest.mark.parametrize("verb", [["inspect"], ["track", "-o", "out.csv", "--overwrite"]])
 def test_a_unit_may_be_named(
     verb: list[str], take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
