@@ -209,6 +209,8 @@ def read(
     path = Path(path)
     if unit is not None and not 0 < unit < LARGEST:
         raise ValueError(f"unit: expected metres per file unit, got {unit}")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: name one of its files")
     reader = _reader(path, format)
     try:
         recording: Recording = reader.read(path, unit=unit, left_handed=left_handed)

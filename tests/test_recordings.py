@@ -210,6 +210,13 @@ def test_units_may_be_confirmed_but_not_contradicted(
         read(path, unit=0.01)
 
 
+@pytest.mark.parametrize("name", ["takes", "take.csv"])
+def test_a_folder_is_no_recording(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).mkdir()
+    with pytest.raises(ValueError, match=f"{name} is a folder: name one of its files"):
+        read(tmp_path / name)
+
+
 @pytest.mark.parametrize("unit", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_unit_is_a_positive_number(unit: float, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="unit: expected metres"):
