@@ -273,11 +273,16 @@ def _bones(found: Calibration, model: Hand, config: _File) -> list[str]:
 def _of_size(size: Size, config: _File) -> list[str]:
     """What is said of a hand's size."""
     low, high = (100 * (end - 1) for end in size.interval)
-    text = f"{100 * (size.likeliest - 1):+.1f} % of the model's (95 %: {low:+.1f} to {high:+.1f})"
-    if size.factor == 1:
+    text = (
+        f"the hand is {100 * (size.likeliest - 1):+.1f} % of the model's (95 %: {low:+.1f} to "
+        f"{high:+.1f})"
+    )
+    if not size.seen.any():
+        text = "no finger moved enough to tell the hand's size: the model's own is kept"
+    elif size.factor == 1:
         text += f": not surely {100 * ALIKE:g} % from the model's own, which is kept"
     return [
-        f"the hand is {text}",
+        text,
         f"markers fit within {1e3 * size.off:.1f} mm, root mean square (usual: 5 to 15 mm)",
         *_poor(size.off > FAR, size.likeliest, config),
     ]

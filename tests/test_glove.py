@@ -19,6 +19,7 @@ from simulated import motion, worn
 from jaxhand import cli, glove, occlusions, report
 from jaxhand.calibration import Calibration
 from jaxhand.datasets import SIG18_AS_GLOVE9
+from jaxhand.hand_size import Size
 from numpy_infer import HandTracker, load_hand, model, wearer
 from numpy_infer.geometry import mirror
 from numpy_infer.hand import ANGLES, POINTS
@@ -212,6 +213,19 @@ def test_a_recorded_hand_is_of_its_own_side(
         printed = capsys.readouterr().out
         assert ("as a left hand they fit better" in printed) == bool(right)
         assert "a poor fit" not in printed or right
+
+
+def test_a_size_that_nothing_tells_is_not_told() -> None:
+    config = glove.CalibrateConfig(
+        recording=Path("free.csv"), out=Path("me.json"), model=Path("m.npz")
+    )
+    for factor, seen, told in (
+        (1.1, True, "the hand is +10.0 % of the model's (95 %: +9.0 to +11.0)"),
+        (1.0, True, "the hand is +10.0 % of the model's (95 %: +9.0 to +11.0): not surely 1 %"),
+        (1.0, False, "no finger moved enough to tell the hand's size: the model's own is kept"),
+    ):
+        size = Size(factor, 1.1, (1.09, 1.11), 0.01, np.array([seen, *[False] * 4]))
+        assert glove._of_size(size, config)[0].startswith(told)
 
 
 @pytest.mark.parametrize(
