@@ -92,9 +92,9 @@ def occlusions(arguments: list[str]) -> int:
     description = (
         "Counts gaps: how many markers of a hand are hidden at once, which, and for how long, one "
         "hand beside two. Training can hide markers in these proportions.\n\n"
-        "Examples: jaxhand occlusions take.trc --json gaps.json --picture gaps.png\n"
-        "jaxhand occlusions both.c3d --left-prefix L_ --right-prefix R_\n"
-        "jaxhand occlusions simulated"
+        "Example: jaxhand occlusions take.trc --json gaps.json --picture gaps.png\n\n"
+        "Example: jaxhand occlusions both.c3d --left-prefix L_ --right-prefix R_\n\n"
+        "Example: jaxhand occlusions simulated"
     )
     config = _parsed(occlusions.OcclusionsConfig, arguments, "jaxhand occlusions", description)
     return _told("occlusions", lambda: occlusions.occlusions(config))

@@ -38,8 +38,8 @@ from numpy_infer.hand import (
     Hand,
     load_hand,
 )
-from numpy_infer.labels import of_hand
-from numpy_infer.recordings import READER_OF, Recording, load_label_map, read
+from numpy_infer.labels import doubted_unit, of_hand
+from numpy_infer.recordings import READER_OF, Recording, doubted_time, load_label_map, read
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
 Split = Literal["train", "validation", "test"]
@@ -174,7 +174,11 @@ def _without_side(stem: str) -> tuple[str, str]:
 def _measured(
     paths: tuple[Path, ...], hand: Hand, reading: Reading, side: str | None = None
 ) -> Dataset:
-    """Markers alone. The side is the one given, or the one in the file's name."""
+    """Markers alone. The side is the one given, or the one in the file's name.
+
+    Raises:
+        ValueError: a unit or a time that cannot be right.
+    """
     sequences = []
     for path in paths:
         labels = path.parent / LABELS
@@ -182,8 +186,11 @@ def _measured(
         recording = read(
             path, label_map=label_map, unit=reading.unit, left_handed=reading.left_handed
         ).measured()
+        own = of_hand(recording, "", hand)
+        for doubt in filter(None, (doubted_unit(own, hand), doubted_time(own))):
+            raise ValueError(f"{path}: {doubt}")
         take, named = _without_side(path.stem)
-        sequences.append(_sequence(recording, hand, take, side or named))
+        sequences.append(_sequence(own, hand, take, side or named))
     return Dataset("", hand, tuple(sequences))
 
 

@@ -109,14 +109,14 @@ def calibrate_person(config: CalibrateConfig, console: Console | None = None) ->
     with console.status("fitting the hand"):
         if len(model.hand) >= DENSE:
             found = calibrate(model.hand, markers, rate=recording.rate)
-            hand, seen, said = found.hand, found.seen, _bones(found, model.hand)
+            hand, seen, said = found.hand, found.seen, _bones(found, model.hand, config)
         else:
             size, other = (hand_size(model, side) for side in (markers, mirror(markers)))
-            hand, seen, said = model.hand.resized(size.factor), size.seen, _of_size(size)
+            hand, seen, said = model.hand.resized(size.factor), size.seen, _of_size(size, config)
             if other.off < OTHER_SIDE * size.off:
-                side, off = "left" if _is_right(config) else "right", 1e3 * other.off
-                change = "no --right, or --left-prefix" if _is_right(config) else "see --right"
-                said.append(f"as a {side} hand they fit better, within {off:.1f} mm: {change}")
+                side, how = _other_side(config)
+                off = 1e3 * other.off
+                said.append(f"as a {side} hand they fit better, within {off:.1f} mm ({how})")
     unseen = tuple(finger for finger, known in zip(FINGERS, seen, strict=True) if not known)
     flat = None
     if held is not None:
@@ -157,7 +157,7 @@ def describe_glove(config: HandConfig, console: Console | None = None) -> None:
         sources=(f"fitted to a recording, from {like.name}",),
     )
     config.out.write_text(json.dumps(hand.to_json(), indent=1) + "\n", "utf-8")
-    for line in _of_glove(found, like):
+    for line in _of_glove(found, like, config):
         console.print(line)
     console.print(f"wrote {config.out}")
 
@@ -185,6 +185,11 @@ def _markers(recording: Recording, hand: Hand, config: _File) -> Array:
 
 def _is_right(config: _File) -> bool:
     return config.right or bool(config.right_prefix)
+
+
+def _other_side(config: _File) -> tuple[str, str]:
+    """The side that the hand was not said to be of, and how to say it."""
+    return ("left", "no --right, or --left-prefix") if _is_right(config) else ("right", "--right")
 
 
 def _held(
@@ -228,7 +233,7 @@ def _unseen(seen: Array) -> list[str]:
     ]
 
 
-def _of_glove(found: Calibration, like: Hand) -> list[str]:
+def _of_glove(found: Calibration, like: Hand, config: _File) -> list[str]:
     """What is said of a new glove's markers, and of how well they fit."""
     moved = np.linalg.norm(found.hand.template - like.template, axis=-1)
     off = float(np.nanmean(found.residual))
@@ -241,14 +246,15 @@ def _of_glove(found: Calibration, like: Hand) -> list[str]:
     far = [name for name, distance in zip(like.markers, moved, strict=True) if distance > MOVED_FAR]
     if off > FAR_OF_NEW or far:
         where = f"; {', '.join(far)} far from where {like.name} has them" if far else ""
+        side, how = _other_side(config)
         said.append(
-            f"a poor fit, which may do harm{where}: are the labels right, is it a right hand "
-            "(--right), did every finger move?"
+            f"a poor fit, which may do harm{where}: are the labels right, is it a {side} hand "
+            f"({how}), did every finger move?"
         )
     return said
 
 
-def _bones(found: Calibration, model: Hand) -> list[str]:
+def _bones(found: Calibration, model: Hand, config: _File) -> list[str]:
     """What is said of a fit of all bones."""
     now, before = (np.linalg.norm(hand.skeleton, axis=-1)[1:] for hand in (found.hand, model))
     off = float(np.nanmean(found.residual))
@@ -260,28 +266,34 @@ def _bones(found: Calibration, model: Hand) -> list[str]:
             f"  {point:11} {1e3 * new:5.1f} mm ({1e3 * (new - old):+.1f})"
             for point, new, old in zip(POINTS[1:], now, before, strict=True)
         ),
-        *_poor(off > FAR_OF_MANY, found.hand.size / model.size),
+        *_poor(off > FAR_OF_MANY, found.hand.size / model.size, config),
     ]
 
 
-def _of_size(size: Size) -> list[str]:
+def _of_size(size: Size, config: _File) -> list[str]:
     """What is said of a hand's size."""
     low, high = (100 * (end - 1) for end in size.interval)
-    text = f"{100 * (size.likeliest - 1):+.1f} % of the model's (95 %: {low:+.1f} to {high:+.1f})"
-    if size.factor == 1:
+    text = (
+        f"the hand is {100 * (size.likeliest - 1):+.1f} % of the model's (95 %: {low:+.1f} to "
+        f"{high:+.1f})"
+    )
+    if not size.seen.any():
+        text = "no finger moved enough to tell the hand's size: the model's own is kept"
+    elif size.factor == 1:
         text += f": not surely {100 * ALIKE:g} % from the model's own, which is kept"
     return [
-        f"the hand is {text}",
+        text,
         f"markers fit within {1e3 * size.off:.1f} mm, root mean square (usual: 5 to 15 mm)",
-        *_poor(size.off > FAR, size.likeliest),
+        *_poor(size.off > FAR, size.likeliest, config),
     ]
 
 
-def _poor(far: bool, factor: float) -> list[str]:
+def _poor(far: bool, factor: float, config: _File) -> list[str]:
     """What is said of a fit with markers far off, or of a hand as large or small as nobody's."""
     if not far and SIZES[1] < factor < SIZES[-2]:
         return []
+    side, how = _other_side(config)
     return [
-        "a poor fit, which may do harm: are the labels right, is it a right hand (--right)? Where "
+        f"a poor fit, which may do harm: are the labels right, is it a {side} hand ({how})? Where "
         "markers sit elsewhere than the model has them, jaxhand hand describes the glove"
     ]

@@ -39,7 +39,7 @@ class Size(NamedTuple):
 
     factor: float
     """Of the model's hand; 1 where the interval, made wider by `ALIKE`, holds 1: then the model's
-    hand will do."""
+    hand will do; and where no finger was seen, for one posture tells no size."""
     likeliest: float
     interval: tuple[float, float]
     """95 %, from blocks of the recording. What one number cannot say of a hand is not in it."""
@@ -76,12 +76,13 @@ def hand_size(model: Model, markers: Array) -> Size:
     drawn = np.random.default_rng(0).integers(BLOCKS, size=(RESAMPLINGS, BLOCKS))
     low, high = np.quantile([_lowest(blocks[:, own].sum(-1)) for own in drawn], (0.025, 0.975))
     nearest = np.abs(SIZES - best).argmin()
+    seen = _seen(angles[nearest])
     return Size(
-        factor=1.0 if low - ALIKE <= 1 <= high + ALIKE else best,
+        factor=1.0 if low - ALIKE <= 1 <= high + ALIKE or not seen.any() else best,
         likeliest=best,
         interval=(float(low), float(high)),
         off=float(np.sqrt(cost[nearest].mean())),
-        seen=_seen(angles[nearest]),
+        seen=seen,
     )
 
 

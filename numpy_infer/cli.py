@@ -32,7 +32,14 @@ from numpy_infer.model import bundled as bundled_models
 from numpy_infer.one_euro import Smoothing
 from numpy_infer.pose import Notice, Status, TrackingState
 from numpy_infer.predictors import BASELINES, PREDICTORS
-from numpy_infer.recordings import Recording, load_label_map, read, write, writer_of
+from numpy_infer.recordings import (
+    Recording,
+    doubted_time,
+    load_label_map,
+    read,
+    write,
+    writer_of,
+)
 from numpy_infer.tracking import Tracked, as_measured, track, track_hands
 
 STRAINED = 8.0
@@ -282,7 +289,7 @@ def _track(options: argparse.Namespace) -> None:
     recording = _read(options)
     prefixes = {"left": options.left_prefix or "", "right": options.right_prefix or ""}
     labels = [labels_of(recording, prefixes[side]) for side in outputs]
-    model = _model(options, labels[0])
+    model = _model(options, labels[0], prefixes[next(iter(outputs))])
     if options.predictor:
         model = replace(model, predictor=options.predictor)
     if options.joints:
@@ -308,6 +315,8 @@ def _track(options: argparse.Namespace) -> None:
     for hand in hands:
         if doubt := doubted_unit(hand, model.body):
             raise ValueError(f"{options.file}: {doubt}")
+    if told := doubted_time(recording):
+        print(f"jaxhand track: {told}", file=sys.stderr)
     if len(hands) == 1:
         results = [track(hands[0], model, right="right" in outputs, report=report)]
     else:
@@ -357,6 +366,12 @@ def _summary(result: Tracked) -> str:
         lines.append(
             f"{100 * far.mean():6.2f} % of the frames have a marker over a metre from the others"
         )
+    late = (result.notice & Notice.NON_POSITIVE_DT) > 0
+    if late.any():
+        lines.append(
+            f"{100 * late.mean():6.2f} % of the frames come no later than the one before: is the "
+            "file's time in order?"
+        )
     # What to expect was measured of markers that had been seen.
     seen = np.logical_or.accumulate(status == Status.OBSERVED)
     hidden = seen & ((status == Status.PREDICTED) | (status == Status.REJECTED))
@@ -388,9 +403,9 @@ def _strain(angles: Array) -> float:
     return float(np.degrees(np.maximum(LOW - usual, usual - HIGH)[_KNUCKLES].max()))
 
 
-def _model(options: argparse.Namespace, labels: Sequence[str]) -> Model:
+def _model(options: argparse.Namespace, labels: Sequence[str], prefix: str) -> Model:
     if options.model in BASELINES:
-        hand = load_hand(options.hand) if options.hand else _fitting(labels, "--hand FILE")
+        hand = load_hand(options.hand) if options.hand else _fitting(labels, "--hand FILE", prefix)
         return Model(hand, predictor=options.model)
     if options.hand:
         raise ValueError(
@@ -399,17 +414,18 @@ def _model(options: argparse.Namespace, labels: Sequence[str]) -> Model:
         )
     if options.model:
         return load(options.model)
-    name = _fitting(labels, "--model FILE, or a baseline: --model affine --hand FILE").name
+    instead = "--model FILE, or a baseline: --model affine --hand FILE"
+    name = _fitting(labels, instead, prefix).name
     if name not in bundled_models():
         raise ValueError(f"no model is bundled for {name}: name one with --model")
     print(f"tracked by the bundled model {name}")
     return load(name)
 
 
-def _fitting(labels: Sequence[str], instead: str) -> Hand:
+def _fitting(labels: Sequence[str], instead: str, prefix: str) -> Hand:
     hand = fitting_hand(labels)
     if hand is None:
-        raise ValueError(unfitting(labels, instead))
+        raise ValueError(unfitting(labels, instead, prefix))
     return hand
 
 

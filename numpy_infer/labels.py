@@ -15,7 +15,7 @@ from numpy_infer.arrays import Array
 from numpy_infer.geometry import second_extent
 from numpy_infer.hand import Hand, bundled, load_hand
 from numpy_infer.pose import DETERMINED_EXTENT
-from numpy_infer.recordings import Recording
+from numpy_infer.recordings import Recording, doubted_time
 
 DISPENSABLE = 1 / 3
 """Share of a hand's markers that a file may have no label of. With so many never seen, the bundled
@@ -90,7 +90,7 @@ def advice(labels: Collection[str], hand: Hand | None = None, prefix: str = "") 
     hands = [hand] if hand else list(map(load_hand, bundled()))
     begun = beginnings(labels)
     if begun and all(len(lacking(one, labels)) == len(one) for one in hands):
-        return [prefixes_told(begun)]
+        return [prefixes_told([prefix + more for more in begun])]
     own = [label for label in labels if not label.startswith(tuple(begun))]
     left = [len(lacking(one, own)) - len(meant(one, own)) for one in hands]
     found = meant(hands[left.index(min(left))], own)
@@ -101,11 +101,14 @@ def advice(labels: Collection[str], hand: Hand | None = None, prefix: str = "") 
 def prefixes_told(begun: Collection[str]) -> str:
     """What is said of labels that begin with these."""
     sides = [{"l": "left", "r": "right"}.get(_plain(prefix)[:1]) for prefix in begun]
-    if None in sides or len(set(sides)) < len(sides):
-        options = ["--left-prefix", "--right-prefix"]
+    if len(sides) == 1 and None in sides:
+        options = " or ".join(f"--{side}-prefix {quote(*begun)}" for side in ("left", "right"))
+    elif None in sides or len(set(sides)) < len(sides):
+        options = "--left-prefix and --right-prefix"
     else:
-        options = [f"--{side}-prefix {quote(p)}" for side, p in zip(sides, begun, strict=True)]
-    return f"labels of a hand begin with {' and '.join(begun)}: see {' '.join(options)}"
+        told = zip(sides, begun, strict=True)
+        options = " ".join(f"--{side}-prefix {quote(prefix)}" for side, prefix in told)
+    return f"labels of a hand begin with {' and '.join(begun)}: see {options}"
 
 
 def of_hand(recording: Recording, prefix: str, hand: Hand) -> Recording:
@@ -158,23 +161,24 @@ def fitting_hand(labels: Collection[str]) -> Hand | None:
     return None
 
 
-def unfitting(labels: Collection[str], instead: str) -> str:
+def unfitting(labels: Collection[str], instead: str, prefix: str = "") -> str:
     """What is said of labels that fit no bundled hand, and what could be done.
 
     Args:
-        labels: all that there are.
+        labels: all that there are, or with a prefix those that begin with it, without it.
         instead: the options that name what to take.
+        prefix: what they begin with in the file.
     """
     text = (
-        f"no bundled hand fits the labels {', '.join(labels)}: rename them with --map, or pass "
-        f"{instead}"
+        f"no bundled hand fits the labels {', '.join(prefix + label for label in labels)}: rename "
+        f"them with --map, or pass {instead}"
     )
     nearest = _by_fit(labels)[0]
     absent = lacking(nearest, labels)
     if len(absent) < len(nearest):
-        text += f"; {nearest.name} lacks {', '.join(absent)}"
-        return "; ".join([text, *advice(labels, nearest)])
-    return "; ".join([text, *advice(labels)])
+        text += f"; {nearest.name} lacks {', '.join(prefix + name for name in absent)}"
+        return "; ".join([text, *advice(labels, nearest, prefix)])
+    return "; ".join([text, *advice(labels, None, prefix)])
 
 
 def without(hand: Hand, labels: Collection[str], prefix: str = "") -> str | None:
@@ -196,7 +200,7 @@ def without(hand: Hand, labels: Collection[str], prefix: str = "") -> str | None
 
 
 def doubts(recording: Recording) -> list[str]:
-    """What `jaxhand inspect` has to say of a recording's labels, and of its hands' size."""
+    """What `jaxhand inspect` has to say of a recording's labels, its hands' size and its time."""
     labels = recording.names
     begun, hand = beginnings(labels), fitting_hand(labels)
     found = [*begun.items(), *([("", hand)] if hand else [])]
@@ -204,7 +208,7 @@ def doubts(recording: Recording) -> list[str]:
     if not begun or hand:
         said += advice(labels, hand)
     sizes = [doubted_unit(prefixed(recording, *one), one[1]) for one in found]
-    return [*said, *dict.fromkeys(filter(None, sizes))]
+    return [*said, *dict.fromkeys(filter(None, [*sizes, doubted_time(recording)]))]
 
 
 def _by_fit(labels: Collection[str]) -> list[Hand]:
@@ -231,10 +235,11 @@ def doubted_unit(recording: Recording, hand: Hand) -> str | None:
     if power == 0:
         return None
     much = "large" if power > 0 else "small"
+    # Of an inch no tenth is a unit: the power of ten nearest to what would do.
+    likely = 10.0 ** round(log10(recording.unit / np.median(known)))
     return (
         f"the markers are {10 ** abs(power)} times too {much} for a hand: is the unit, "
-        f"{recording.unit:g} m by the file or by --unit, right? {recording.unit / 10**power:g} m "
-        "would do"
+        f"{recording.unit:g} m by the file or by --unit, right? {likely:g} m would do"
     )
 
 

@@ -28,6 +28,10 @@ BUILT_IN = {
 READER_OF = {".trc": "trc", ".tsv": "qualisys", ".bvh": "bvh"}  # `.csv` is told by its first line
 WRITER_OF = {".trc": "trc", ".tsv": "qualisys", ".csv": "plain_csv"}
 
+SLOWEST = 5.0
+"""Hz: nobody records hands at less, but in a file whose time is in milliseconds or counts frames it
+looks like that."""
+
 # diag(1, 1, −1): a left-handed frame's coordinates in the right-handed frame that shares x and y
 _REFLECT_Z = np.array([1.0, 1.0, -1.0])
 
@@ -195,7 +199,8 @@ def read(
     unit: metres per unit of the file, for files that do not say (BVH, bare CSV).
     left_handed: the file's frame is left-handed; z is negated. The authors' CSV always is, and
         needs no telling.
-    label_map: {label in the file: our name}; other labels only lose a prefix such as `Subject:`.
+    label_map: {label in the file: our name}; other labels only lose a prefix such as `Subject:`,
+        and keep it where it alone tells them apart, as those of two hands.
     format: a reader's name, where the suffix and the first line would pick another.
 
     Raises ValueError, with file and line, for whatever is wrong inside the file; nothing is
@@ -204,6 +209,8 @@ def read(
     path = Path(path)
     if unit is not None and not 0 < unit < LARGEST:
         raise ValueError(f"unit: expected metres per file unit, got {unit}")
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder: name one of its files")
     reader = _reader(path, format)
     try:
         recording: Recording = reader.read(path, unit=unit, left_handed=left_handed)
@@ -259,6 +266,18 @@ def median_rate(time: np.ndarray, source: object) -> float:
     return float(median)
 
 
+def doubted_time(recording: Recording) -> str | None:
+    """What is to be said of a recording whose frames are too far apart for seconds; or None."""
+    steps = np.diff(recording.time)
+    step = float(np.median(steps)) if steps.size else 0.0
+    if step <= 1 / SLOWEST:
+        return None
+    return (
+        f"the frames are {step:.3g} s apart: is the file's time in milliseconds, or does it count "
+        "frames? Seconds are expected"
+    )
+
+
 def _reader(path: Path, format: str | None) -> ModuleType:
     plugins = _plugins()
     if format is not None:
@@ -309,11 +328,15 @@ def _csv_format(path: Path) -> str:
 
 
 def _relabelled(recording: Recording, label_map: Mapping[str, str]) -> Recording:
-    """Our names for mapped labels; the others without their `Subject:` prefix."""
+    """Our names for mapped labels; the others without their `Subject:` prefix, unless two of them
+    would then be one."""
     bare = {label: _without_prefix(label) for label in recording.names}
     there = dict.fromkeys((*bare, *bare.values()))
     _check_known(label_map, there, f"{recording.source}: label map: ")
-    names = {label: label_map.get(label, label_map.get(bare[label], bare[label])) for label in bare}
+    mapped = {label: label_map.get(label, label_map.get(bare[label])) for label in bare}
+    left = [bare[label] for label, name in mapped.items() if name is None]
+    kept = dict(zip(bare, bare, strict=True)) if len(set(left)) < len(left) else bare
+    names = {label: kept[label] if name is None else name for label, name in mapped.items()}
     by_name: dict[str, str] = {}
     for label, name in names.items():
         if name in by_name:

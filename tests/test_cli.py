@@ -345,6 +345,24 @@ def test_prefixes_of_two_hands_are_pointed_out(
     assert "1000 times too large" in printed, "the left one is looked at, too"
     assert begun in refused(["track", "both.csv", "-o", "out.csv"], capsys)
     assert begun in refused(["track", "both.csv", "--model", "glove9", "-o", "out.csv"], capsys)
+    short = refused(["track", "both.csv", "--left-prefix", "L", "-o", "out.csv"], capsys)
+    assert short.endswith("labels of a hand begin with L_: see --left-prefix L_\n")
+
+
+def test_two_subjects_of_one_file_are_two_hands(
+    take: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = read(take)
+    names = [prefix + name for prefix in ("L_", "R_") for name in HAND.markers]
+    both = np.concatenate([whole.markers, whole.markers], 1)
+    write(replace(whole, names=names, markers=both, filled=()), tmp_path / "both.csv")
+    text = (tmp_path / "both.csv").read_text()
+    (tmp_path / "both.csv").write_text(text.replace("L_", "Left:").replace("R_", "Right:"))
+    options = ["--left-prefix", "Left:", "--right-prefix", "Right:"]
+    assert f"see {' '.join(options)}\n" in refused(["track", "both.csv", "-o", "out.csv"], capsys)
+    assert main(["track", "both.csv", "-o", "out.csv", *options]) == 0
+    assert main(["track", take, "-o", "one.csv"]) == 0
+    assert (tmp_path / "out_left.csv").read_text() == (tmp_path / "one.csv").read_text()
 
 
 def test_too_few_labels_are_refused_with_what_is_lacking(
@@ -394,6 +412,33 @@ def test_a_wrong_unit_is_told_of_and_not_tracked(
         assert all(part in printed for part in said)
         assert ("for a hand" in printed) == bool(said)
     assert refusal.count("\n") == bool(said)
+
+
+@pytest.mark.parametrize("verb", [["inspect"], ["track", "-o", "out.csv"]])
+@pytest.mark.parametrize(("hertz", "said"), [(0.06, True), (1, True), (10, False), (1e3, False)])
+def test_a_time_that_cannot_be_in_seconds_is_told_of(
+    verb: list[str], hertz: float, said: bool, take: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In milliseconds, or frame numbers, also where the file states a rate."""
+    recording = read(take)
+    write(replace(recording, time=np.arange(30) / hertz), Path(take), overwrite=True)
+    assert main([verb[0], take, *verb[1:]]) == 0
+    told = "".join(capsys.readouterr())
+    assert (f"the frames are {1 / hertz:.3g} s apart: is the file's time in mill" in told) == said
+    assert ("s apart" in told) == said
+
+
+@pytest.mark.parametrize("order", [(3, 4), (4, 3), (3, 3)], ids=str)
+def test_frames_that_are_not_in_order_are_told_of(
+    order: tuple[int, int], take: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = read(take)
+    time = recording.time.copy()
+    time[[3, 4]] = time[list(order)]
+    write(replace(recording, time=time), Path(take), overwrite=True)
+    assert main(["track", take, "-o", "out.csv"]) == 0
+    told = f"{100 / 30:6.2f} % of the frames come no later than the one before"
+    assert (told in capsys.readouterr().out) == (order != (3, 4))
 
 
 @pytest.mark.parametrize("verb", [["inspect"], ["track", "-o", "out.csv", "--overwrite"]])

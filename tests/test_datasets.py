@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from jaxhand.sequences import Dataset, Sequence, complete_frames, smooth
 from numpy_infer.arrays import Array
 from numpy_infer.geometry import kabsch, mirror, nearest_rotation, transform
 from numpy_infer.hand import ANGLES, FINGERS, POINTS, TIPS, load_hand
-from numpy_infer.recordings import Recording, write
+from numpy_infer.recordings import Recording, read, write
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
 HAND = load_hand("glove9")
@@ -188,6 +189,20 @@ def test_what_tracking_filled_is_no_recording_to_learn_from(tmp_path: Path) -> N
     write(take, tmp_path / "a.csv")
     (sequence,) = load(f"recordings:{tmp_path / 'a.csv'}", "test").sequences
     np.testing.assert_array_equal(np.isnan(sequence.markers).all(-1), status > 0)
+
+
+@pytest.mark.parametrize(
+    ("size", "slow", "told"), [(1000, 1, "1000 times too large"), (1, 1000, "8.33 s apart")]
+)
+def test_a_unit_or_a_time_that_cannot_be_right_is_refused(
+    size: float, slow: float, told: str, tmp_path: Path
+) -> None:
+    write_takes(tmp_path, ["a"])
+    take = read(tmp_path / "a.trc")
+    wrong = replace(take, markers=size * take.markers, time=slow * take.time)
+    write(wrong, tmp_path / "a.trc", overwrite=True)
+    with pytest.raises(ValueError, match=rf"a\.trc: the .* {told}"):
+        load(f"recordings:{tmp_path}", "test")
 
 
 def test_complete_frames_are_those_with_every_marker() -> None:

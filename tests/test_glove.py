@@ -19,6 +19,7 @@ from simulated import motion, worn
 from jaxhand import cli, glove, occlusions, report
 from jaxhand.calibration import Calibration
 from jaxhand.datasets import SIG18_AS_GLOVE9
+from jaxhand.hand_size import Size
 from numpy_infer import HandTracker, load_hand, model, wearer
 from numpy_infer.geometry import mirror
 from numpy_infer.hand import ANGLES, POINTS
@@ -172,6 +173,7 @@ def test_how_well_a_new_glove_fits_is_told(
         (off,) = re.findall(r"fit within (.*) mm on average \(usual: up to 4 mm\)", printed)
         assert (float(off) > 10) == poor
         assert ("a poor fit" in printed) == poor
+        assert ("is it a right hand (--right), did" in printed) == (poor and not right)
         assert "wrote" in printed
 
 
@@ -184,13 +186,14 @@ def test_a_marker_far_from_its_place_is_named() -> None:
         residual=np.full((3, 9), 1e-3),
         seen=np.array([True, True, False, True, True]),
     )
-    said = glove._of_glove(found, GLOVE)
+    config = glove.HandConfig(recording=Path("free.csv"), out=Path("mine.json"))
+    said = glove._of_glove(found, GLOVE, config)
     assert any(f"harm; {GLOVE.markers[5]} far from where glove9 has them" in line for line in said)
     assert [line for line in said if line.startswith("not seen")] == [
         "not seen yet: the middle; bend and stretch it for a better fit"
     ]
     found = found._replace(hand=GLOVE)
-    assert not any("a poor fit" in line for line in glove._of_glove(found, GLOVE))
+    assert not any("a poor fit" in line for line in glove._of_glove(found, GLOVE, config))
 
 
 @pytest.mark.parametrize("user", ["User1", "User2", "User3"])
@@ -212,6 +215,19 @@ def test_a_recorded_hand_is_of_its_own_side(
         assert "a poor fit" not in printed or right
 
 
+def test_a_size_that_nothing_tells_is_not_told() -> None:
+    config = glove.CalibrateConfig(
+        recording=Path("free.csv"), out=Path("me.json"), model=Path("m.npz")
+    )
+    for factor, seen, told in (
+        (1.1, True, "the hand is +10.0 % of the model's (95 %: +9.0 to +11.0)"),
+        (1.0, True, "the hand is +10.0 % of the model's (95 %: +9.0 to +11.0): not surely 1 %"),
+        (1.0, False, "no finger moved enough to tell the hand's size: the model's own is kept"),
+    ):
+        size = Size(factor, 1.1, (1.09, 1.11), 0.01, np.array([seen, *[False] * 4]))
+        assert glove._of_size(size, config)[0].startswith(told)
+
+
 @pytest.mark.parametrize(
     ("off", "size", "poor"),
     [(2e-3, 1.2, False), (5e-3, 1.0, True), (2e-3, 0.7, True), (2e-3, 1.4, True)],
@@ -220,7 +236,15 @@ def test_a_fit_of_all_bones_is_judged_too(off: float, size: float, poor: bool) -
     found = Calibration(
         **dict.fromkeys(Calibration._fields),
     )._replace(hand=GLOVE.resized(size), residual=np.full((3, 9), off), tracked=np.ones(3, bool))
-    assert any("a poor fit" in line for line in glove._bones(found, GLOVE)) == poor
+    for right, asked in (
+        (False, "is it a right hand (--right)?"),
+        (True, "is it a left hand (no --right, or --left-prefix)?"),
+    ):
+        config = glove.CalibrateConfig(
+            recording=Path("free.csv"), out=Path("me.json"), model=Path("m.npz"), right=right
+        )
+        said = glove._bones(found, GLOVE, config)
+        assert any(f"are the labels right, {asked}" in line for line in said) == poor
 
 
 @pytest.mark.parametrize(

@@ -66,9 +66,17 @@ def test_what_is_hidden_and_what_is_a_ghost_decide_nothing(model: Model) -> None
     assert hand_size(model, markers).likeliest == pytest.approx(clean, abs=ALIKE)
 
 
-def test_a_still_hand_has_not_been_seen(model: Model) -> None:
+@pytest.mark.parametrize("noise", [0.0, 0.3e-3])
+def test_a_still_hand_has_not_been_seen_and_keeps_the_models_size(
+    model: Model, noise: float
+) -> None:
+    """However sure one posture, over and over, looks."""
     still = np.repeat(recording(1.1)[:1], FRAMES, 0)
-    assert not hand_size(model, still).seen.any()
+    still += noise * np.random.default_rng(0).standard_normal(still.shape)
+    found = hand_size(model, still)
+    assert not found.seen.any()
+    assert found.interval[1] - found.interval[0] < 0.01
+    assert found.factor == 1
 
 
 def test_what_cannot_be_measured_is_named(model: Model) -> None:

@@ -26,6 +26,7 @@ from numpy_infer.labels import (
     meant,
     prefixed,
     tracked_without,
+    unfitting,
 )
 from numpy_infer.recordings import Recording, load_label_map, read
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
@@ -150,8 +151,27 @@ def test_what_the_labels_of_a_hand_begin_with_is_found(
     if prefixes[0][0] in sides:
         options = [f"--{sides[prefix[0]]}-prefix {quote(prefix)}" for prefix in prefixes]
         assert told.endswith(f"see {' '.join(options)}")
+    else:
+        assert told.endswith("see --left-prefix and --right-prefix")
     assert not beginnings(hand.markers)
     assert not beginnings([f"L_{name}" for name in hand.markers[:3]])
+
+
+def test_one_hand_of_an_unknown_side_may_be_either() -> None:
+    (told,) = advice([f"Bob {name}" for name in GLOVE.markers])
+    assert told.endswith("see --left-prefix 'Bob ' or --right-prefix 'Bob '")
+
+
+@pytest.mark.parametrize("begun", ["L", "L_h"])
+def test_a_prefix_that_is_cut_short_is_made_whole(begun: str) -> None:
+    rest = "L_hand_".removeprefix(begun)
+    labels = [rest + name for name in GLOVE.markers]
+    whole = begun + rest
+    told = unfitting(labels, "--model FILE", begun)
+    assert f"no bundled hand fits the labels {whole}{GLOVE.markers[0]}, " in told
+    assert told.endswith(f"labels of a hand begin with {whole}: see --left-prefix {whole}")
+    absent = ", ".join(begun + name for name in GLOVE.markers[5:])
+    assert f"; glove9 lacks {absent}" in unfitting(GLOVE.markers[:5], "--model FILE", begun)
 
 
 def test_a_label_map_is_read_from_json(tmp_path: Path) -> None:
@@ -253,6 +273,17 @@ def test_a_unit_that_is_wrong_by_tens_is_doubted_and_the_right_one_named(
     assert told.startswith(f"the markers are {10 ** abs(power)} times too {much} for a hand: ")
     assert "is the unit, 0.01 m by" in told
     assert told.endswith(f" {0.01 / 10**power:g} m would do")
+
+
+@given(hands, st.sampled_from([0.0254, 0.3048]), st.sampled_from([1e-3, 1e-4]), st.integers(0, 99))
+def test_the_unit_that_would_do_is_metric(
+    hand: Hand, wrong: float, right: float, seed: int
+) -> None:
+    markers = wrong / right * postures(hand, seed)
+    file = replace(recording(hand.markers, markers), unit=wrong)
+    told = doubted_unit(file, hand)
+    assert told is not None
+    assert told.endswith(f" {right:g} m would do")
 
 
 def test_what_is_not_seen_has_no_size() -> None:

@@ -13,7 +13,7 @@ pytest.importorskip("jax")
 
 import tyro
 
-from jaxhand import evaluation, predictors
+from jaxhand import cli, evaluation, predictors
 from jaxhand.demo import DemoConfig
 from jaxhand.glove import CalibrateConfig, HandConfig
 from jaxhand.occlusions import OcclusionsConfig
@@ -83,6 +83,21 @@ def test_every_command_is_one(arguments: list[str]) -> None:
         tyro.cli(CONFIGS[arguments[0]], args=arguments[1:])
     else:
         parser().parse_args(arguments)
+
+
+@pytest.mark.parametrize("verb", CONFIGS)
+def test_every_example_of_a_verbs_help_is_a_command_on_a_line_of_its_own(
+    verb: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        getattr(cli, verb)(["--help"])
+    examples = re.findall(r"^Examples?: jaxhand (.*)$", capsys.readouterr().out, re.MULTILINE)
+    assert examples
+    for example in examples:
+        name, *arguments = shlex.split(example)
+        assert name == verb
+        assert "jaxhand" not in arguments
+        tyro.cli(CONFIGS[verb], args=arguments)
 
 
 def test_a_command_that_is_none_would_be_seen() -> None:

@@ -205,8 +205,16 @@ def test_units_may_be_confirmed_but_not_contradicted(
     write(small(), path)
     stated = 1.0 if suffix == ".csv" else 1e-3
     assert_same(read(path, unit=stated), read(path), 0.0)
-    with pytest.raises(ValueError, match=r"take.*unit=0\.01"):
+    told = rf"take.* states {stated:g} m as its unit, and 0\.01 m was given: .*, correct it there"
+    with pytest.raises(ValueError, match=told):
         read(path, unit=0.01)
+
+
+@pytest.mark.parametrize("name", ["takes", "take.csv"])
+def test_a_folder_is_no_recording(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).mkdir()
+    with pytest.raises(ValueError, match=f"{name} is a folder: name one of its files"):
+        read(tmp_path / name)
 
 
 @pytest.mark.parametrize("unit", [0.0, -1.0, float("nan"), float("inf")])
@@ -308,11 +316,12 @@ def test_prefixes_are_stripped_and_labels_mapped(tmp_path: Path) -> None:
         read(path, label_map={"Foot:a": "thumb"})
 
 
-def test_prefixes_that_alone_tell_labels_apart_need_a_label_map(tmp_path: Path) -> None:
-    path = csv_with(tmp_path / "take.csv", "Left:a", "Right:a")
-    with pytest.raises(ValueError, match="duplicate marker name 'a', from 'Left:a' and 'Right:a'"):
-        read(path)
-    assert read(path, label_map={"Right:a": "other"}).names == ("a", "other")
+def test_prefixes_that_alone_tell_labels_apart_are_kept(tmp_path: Path) -> None:
+    path = csv_with(tmp_path / "take.csv", "Left:a", "Right:a", "Right:b", "c")
+    assert read(path).names == ("Left:a", "Right:a", "Right:b", "c")
+    assert read(path, label_map={"Right:a": "other"}).names == ("a", "other", "b", "c")
+    with pytest.raises(ValueError, match="duplicate marker name 'x', from 'Left:a' and 'Right:a'"):
+        read(path, label_map={"a": "x"})
 
 
 def test_writing_replaces_a_file_only_when_told(tmp_path: Path) -> None:

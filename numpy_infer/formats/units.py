@@ -47,7 +47,10 @@ def agreed(path: Path, stated: float | None, given: float | None) -> float:
     Raises ValueError if neither says it, or if they disagree.
     """
     if stated is not None and given is not None and not isclose(stated, given, rel_tol=1e-9):
-        raise ValueError(f"{path}: the file's unit is {stated} m, but unit={given} was given")
+        raise ValueError(
+            f"{path}: the file states {stated:g} m as its unit, and {given:g} m was given: leave "
+            "that out or, where the file is wrong, correct it there"
+        )
     metres = given if stated is None else stated
     if metres is None:
         raise ValueError(
