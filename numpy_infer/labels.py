@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import replace
-from difflib import get_close_matches
+from difflib import SequenceMatcher
 from math import log10
 from shlex import quote
 
@@ -54,10 +54,17 @@ def meant(hand: Hand, labels: Collection[str]) -> dict[str, str]:
     for likeness, others in ((1.0, hand.markers), (CLOSE, names)):
         for label in labels:
             alike = [name for name in absent if _digits(name) == _digits(label)]
-            near = get_close_matches(_plain(label), alike, 1, likeness)
+            told = [(_likeness(name, _plain(label)), name) for name in alike]
+            near = [one for one in told if one[0] >= likeness]
             if near and label not in others and label not in found:
-                found[label] = absent.pop(near[0])
+                found[label] = absent.pop(max(near)[1])
     return found
+
+
+def _likeness(one: str, other: str) -> float:
+    """`difflib`'s ratio, read from whichever end says more: of a repeated part it takes the first,
+    and so finds little of middle_middle in middl_middle."""
+    return max(SequenceMatcher(None, one[::way], other[::way]).ratio() for way in (1, -1))
 
 
 def _plain(label: str) -> str:

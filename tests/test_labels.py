@@ -117,6 +117,16 @@ def test_a_misspelt_label_is_taken_for_the_marker_that_is_lacking(
     assert advice(labels) == advice(labels, hand)
 
 
+@pytest.mark.parametrize("hand", HANDS, ids=lambda hand: hand.name)
+def test_a_letter_too_few_anywhere_is_asked_about(hand: Hand) -> None:
+    """Also where a name says a word twice."""
+    for name in hand.markers:
+        for at in range(1, len(name)):
+            label = name[:at] + name[at + 1 :]
+            if not any(sign.isdigit() for sign in name[at]):
+                assert meant(hand, [*lacking(hand, [name]), label]) == {label: name}
+
+
 def test_every_name_may_be_written_in_another_way() -> None:
     for hand in HANDS:
         for way in range(3):
