@@ -28,6 +28,7 @@ from jaxhand.geometry import kabsch, mean_point, second_extent, transform
 from jaxhand.output import leading
 from numpy_infer.arrays import Array
 from numpy_infer.gate import (
+    ASTRAY,
     BRIEFEST,
     CALM_SECONDS,
     FRAME,
@@ -231,9 +232,14 @@ def _motion(places: Array, markers: Array, fresh: Array) -> tuple[Array, Array]:
     both = use[..., :, None] * use[..., None, :]
     earlier, now = _distances(places) * both, _distances(markers) * both
     change = earlier - now
+    # A few that are suddenly kilometres from most others have no say at all: the least would do.
+    count = (use > 0).sum(-1, keepdims=True)
+    astray = 2 * (jnp.abs(change) > ASTRAY).sum(-1) > count
+    use = jnp.where(astray & (2 * astray.sum(-1, keepdims=True) < count), 0, use)
     votes = (use[..., None, :] / (1 + jnp.minimum(change * change, 1) / ROBUST_SCALE**2)).sum(-1)
     # Sizes that are no hand's would overflow in float32.
-    size = jnp.maximum(earlier, now).max((-1, -2))
+    both = use[..., :, None] * use[..., None, :]
+    size = (jnp.maximum(earlier, now) * both).max((-1, -2))
     use = use / (1 + size * size)[..., None]
     first = use * (votes / markers.shape[-2]) ** VOTES
 

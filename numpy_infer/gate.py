@@ -69,6 +69,8 @@ ROBUST_SCALE, ROBUST_ROUNDS = 8e-3, 3
 1987), and rounds of reweighting."""
 VOTES = 4
 """To which power goes the part of the markers that keep their distance from one."""
+ASTRAY = 1.0
+"""Metres: no marker comes or goes so far from another between two frames."""
 
 BRIEFEST = 1e-4
 """Seconds: a shorter frame tells no velocity."""
@@ -378,9 +380,14 @@ def _motion(places: Array, markers: Array, fresh: Array) -> tuple[Array, Array]:
     both = use[..., :, None] * use[..., None, :]
     earlier, now = distances(places) * both, distances(markers) * both
     change = earlier - now
+    # A few that are suddenly kilometres from most others have no say at all: the least would do.
+    count = (use > 0).sum(-1, keepdims=True)
+    astray = 2 * (np.abs(change) > ASTRAY).sum(-1) > count
+    use = np.where(astray & (2 * astray.sum(-1, keepdims=True) < count), 0, use)
     votes = (use[..., None, :] / (1 + np.minimum(change * change, 1) / ROBUST_SCALE**2)).sum(-1)
     # Sizes that are no hand's would overflow in float32.
-    size = np.maximum(earlier, now).max((-1, -2))
+    both = use[..., :, None] * use[..., None, :]
+    size = (np.maximum(earlier, now) * both).max((-1, -2))
     use = use / (1 + size * size)[..., None]
     motion = kabsch(places, markers, use * (votes / markers.shape[-2]) ** VOTES, eye)
     for _ in range(ROBUST_ROUNDS):
