@@ -60,8 +60,8 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
 
 def _expected_error(model: Model, state: State) -> Array:
     """`[..., M]` metres: the marker's share of the model's table by number hidden and change of
-    posture, and what its correction has lost, both bent to where no marker is off further; of a
-    visible one what is left of its way back."""
+    posture, and what its correction has lost, both bent to where no marker is off further, beside
+    the data's own noise; of a visible one what is left of its way back."""
     dtype = state.drift.dtype
     table = jnp.asarray(model.expected_error, dtype)
     hidden = (~state.visible).sum(-1)

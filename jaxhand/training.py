@@ -88,8 +88,8 @@ class TrainingConfig:
     joint_layers: Layers = (Dense(200), Dense(200), Dense(200))
     """Hidden layers of the joint network, likewise."""
     joints: bool = True
-    """The joint network, too: on the data's joint truth or, where there is none, on simulated
-    postures in the same glove."""
+    """Train the joint network, too: on the data's joint truth or, where there is none, on
+    simulated postures in the same glove."""
     position_weight: float = 30.0
     """Weight of the joints' positions, through forward kinematics, in the joint network's loss
     beside the mean square of its angles."""

@@ -81,8 +81,8 @@ def hand_pose(model: Model, state: State, late: Array) -> HandPose:
 
 def _expected_error(model: Model, state: State) -> Array:
     """`[..., M]` metres: the marker's share of the model's table by number hidden and change of
-    posture, and what its correction has lost, both bent to where no marker is off further; of a
-    visible one what is left of its way back."""
+    posture, and what its correction has lost, both bent to where no marker is off further, beside
+    the data's own noise; of a visible one what is left of its way back."""
     hidden, dtype = ~state.visible, state.drift.dtype
     some_hidden = np.count_nonzero(hidden)
     if not (some_hidden or np.count_nonzero(state.correction)):

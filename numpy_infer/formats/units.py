@@ -51,10 +51,10 @@ def agreed(path: Path, stated: float | None, given: float | None) -> float:
             f"{path}: the file states {stated:g} m as its unit, and {given:g} m was given: leave "
             "that out or, where the file is wrong, correct it there"
         )
-    metres = given if stated is None else stated
-    if metres is None:
+    found = given if stated is None else stated
+    if found is None:
         raise ValueError(
             f"{path}: the file does not state its unit; pass --unit mm (cm, m, in), or the metres "
             "in one of its units: --unit 0.001, in Python unit=0.001"
         )
-    return metres
+    return found
