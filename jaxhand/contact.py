@@ -350,7 +350,7 @@ def own_repulsion(points: Array, radii: Array, allowed: float) -> tuple[Array, A
     parts = (1 - part, part, opposite - 1, -opposite)
     pushed = jnp.concatenate([force * part for part in parts], 1)
     # One product with a table for all pairs: adding up by index is slow.
-    points = jnp.tensordot(jnp.asarray(_INCIDENCE), pushed, (1, 1))
+    points = jnp.tensordot(jnp.asarray(_INCIDENCE), pushed, (1, 1), precision="highest")
     return jnp.moveaxis(points, 1, 0), (deep * deep).sum(0), deep.max(0)
 
 
@@ -367,7 +367,8 @@ def repulsion(
     sides = []
     for share, axis, sign in ((part, 2, 1), (opposite, 1, -1)):
         at_end, whole = apart((sign * (force * share).sum(axis), sign * force.sum(axis)))
-        at_start = jnp.moveaxis(jnp.tensordot(starting, whole - at_end, (1, 1)), 1, 0)
+        at_start = jnp.tensordot(starting, whole - at_end, (1, 1), precision="highest")
+        at_start = jnp.moveaxis(at_start, 1, 0)
         sides.append(at_start.at[:, 1:].add(at_end))
     return sides[0], sides[1], (deep * deep).sum((0, 1)), deep.max((0, 1))
 

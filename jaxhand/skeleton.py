@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,6 +19,7 @@ from numpy_infer.finger_forms import (
     JOINT_AXES,
     OUTER_ANGLES,
     SIGNS,
+    FingerForms,
     finger_forms,
 )
 from numpy_infer.hand import CHAINS, JOINTS, Hand
@@ -196,7 +198,7 @@ def place_fingers(
     base = jnp.asarray(hand.skeleton, dtype)[1:16:3]
     waves = _waves(angles[..., FINGER_ANGLES])
     turn = _form(waves[..., 0, :, :], BASE_FORM).reshape(*batch, 5, 3, 3)
-    own = _form(waves[..., 1, :, :], finger_forms(hand, jnp).beyond).reshape(*batch, 5, 3, 10)
+    own = _form(waves[..., 1, :, :], _forms_of(hand).beyond).reshape(*batch, 5, 3, 10)
     if markers is not None:
         modelled = product(turn, own[..., 9:])[..., 0]
         measured = jnp.where(has[:, None] > 0, markers[..., ends, :] - base, modelled)
@@ -220,6 +222,12 @@ def place_fingers(
 def _waves(angles: Array) -> Array:
     """`[..., 3]` 1, cosine and sine of `[...]`."""
     return jnp.stack([jnp.ones_like(angles), jnp.cos(angles), jnp.sin(angles)], -1)
+
+
+def _forms_of(hand: Hand) -> FingerForms:
+    """`finger_forms`, which may be asked of a traced hand."""
+    with jax.default_matmul_precision("highest"):
+        return finger_forms(hand, jnp)
 
 
 def _form(waves: Array, form: Array) -> Array:
@@ -254,7 +262,7 @@ def bend_fingers(hand: Hand, angles: Array, markers: Array) -> Array:
     zero = jnp.zeros_like(value[..., 0])
     slope = jnp.stack([zero, -value[..., 2], value[..., 1]], -1)
     by_first, by_last = (value.at[..., i, :].set(slope[..., i, :]) for i in (0, 2))
-    form = finger_forms(hand, jnp).square
+    form = _forms_of(hand).square
     square, *sloping = (_form(waves, form)[..., 0] for waves in (value, by_first, by_last))
     reach = jnp.sqrt(jnp.maximum(square, 0))
     slopes = jnp.stack(sloping, -1) / (2 * jnp.where(reach > 0, reach, 1))[..., None]

@@ -18,7 +18,7 @@ def twice(values: Array, count: int = 1) -> Array:
 
 
 def test_xla_on_the_cpu_leaves_barriers_where_they_are() -> None:
-    values = jnp.arange(4.0)
+    values = jax.device_put(jnp.arange(4.0), jax.devices("cpu")[0])
     program = jax.jit(twice, compiler_options=KEEP_BARRIERS).lower(values)
     assert "opt-barrier" in program.compile().as_text()
 

@@ -170,7 +170,9 @@ def test_a_rigid_motion_moves_all_and_turns_no_joint(
     expected = np.asarray(still.positions) @ rotation.T + translation
     # Descent is no contraction: rounding of 1e-7 m in the markers grows on the way.
     np.testing.assert_allclose(found.positions, expected, atol=2e-4)
-    np.testing.assert_allclose(found.wrist_rotation, rotation @ still.wrist_rotation, atol=1e-5)
+    np.testing.assert_allclose(
+        found.wrist_rotation, rotation @ np.asarray(still.wrist_rotation), atol=1e-5
+    )
 
 
 @BOTH
