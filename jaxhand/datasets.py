@@ -157,6 +157,15 @@ def load(
     return replace(dataset, name=spec.name, weight=spec.weight)
 
 
+def default_takes(spec: DatasetSpec, split: Split) -> tuple[str, ...]:
+    """The takes of a default split, without their side; none if the data set is not found."""
+    if spec.name not in SOURCES or spec.path is None:
+        return ()
+    source = SOURCES[spec.name]
+    stems = source.splits(tuple(source.files(spec.path))).get(split, ())
+    return tuple(dict.fromkeys(_without_side(stem)[0] for stem in stems))
+
+
 _SIDE = re.compile(
     r"[ _.-]?(?<![A-Za-z])(left|right|LEFT|RIGHT)([Hh]and|HAND)?(?![a-z])"
     r"|[ _.-]?(Left|Right)([Hh]and)?(?![a-z])"

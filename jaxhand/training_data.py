@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxhand import simulation
-from jaxhand.datasets import OWN, SIMULATED, Split, load, parse_spec
+from jaxhand.datasets import OWN, SIMULATED, DatasetSpec, Split, default_takes, load, parse_spec
 from jaxhand.occlusions import FEWEST_LEFT
 from jaxhand.sequences import Dataset, Sequence
 from jaxhand.tasks import Frames, complete
@@ -53,6 +54,7 @@ def collect(config: TrainingConfig) -> Given:
     start = None if config.start is None else load_model(config.start)
     recorded, held_out = (_load(config, split, start) for split in ("train", "validation"))
     specs = [parse_spec(text) for text in config.data]
+    of_files = [spec for spec in specs if spec.name != SIMULATED]
     hand = _hand_of(config, recorded, start)
     made = simulated_frames(hand, config.seed)
     training, validation = made
@@ -61,10 +63,7 @@ def collect(config: TrainingConfig) -> Given:
         weight = sum(spec.weight for spec in specs if spec.name == SIMULATED)
         simulated, measured = weight * len(made[0].markers), _weight(training, recorded)
         training = training._replace(simulated=simulated / (simulated + measured))
-    notes = [
-        f"{own.name}: {_takes(own)} to train, {_takes(other)} to validate"
-        for own, other in zip(recorded, held_out, strict=True)
-    ]
+    notes = [_split(*parts) for parts in zip(of_files, recorded, held_out, strict=True)]
     joint_frames = None
     if config.joints and (training.angles is None or validation.angles is None):
         joint_frames = made if start is None or start.joint_network is None else None
@@ -81,8 +80,24 @@ def collect(config: TrainingConfig) -> Given:
 def _takes(dataset: Dataset) -> str:
     names = sorted({sequence.take for sequence in dataset.sequences})
     seconds = sum(len(sequence.markers) / sequence.rate for sequence in dataset.sequences)
-    said = ", ".join(names) if len(names) <= MOST_NAMED else f"{len(names)} takes"
-    return f"{said} ({seconds:.0f} s)"
+    return f"{_named(names)} ({seconds:.0f} s)"
+
+
+def _named(takes: Collection[str]) -> str:
+    return ", ".join(takes) if len(takes) <= MOST_NAMED else f"{len(takes)} takes"
+
+
+def _split(spec: DatasetSpec, training: Dataset, validation: Dataset) -> str:
+    """Which takes are for what: `jaxhand evaluate` goes by the default split if told no other."""
+    said = f"{training.name}: {_takes(training)} to train, {_takes(validation)} to validate"
+    used = {s.take.split("/")[0] for dataset in (training, validation) for s in dataset.sequences}
+    tested = default_takes(spec, "test")
+    if not tested:
+        return said
+    if both := [take for take in tested if take in used]:
+        names = ", ".join(both)
+        return f"{said}; `jaxhand evaluate` would test on {names}, too: name others by its --test"
+    return f"{said}; {_named(tested)} left to test on"
 
 
 def simulated_frames(hand: Hand, seed: int) -> tuple[Frames, Frames]:

@@ -339,10 +339,12 @@ def _track(options: argparse.Namespace) -> None:
 def _outputs(options: argparse.Namespace) -> dict[str, Path]:
     """The file to write of each side that is tracked."""
     out: Path = options.output
+    if options.right and options.left_prefix:
+        raise ValueError(
+            "--right says nothing beside --left-prefix: pass --right-prefix for the other"
+        )
     if options.left_prefix and options.right_prefix:
         return {side: out.with_stem(f"{out.stem}_{side}") for side in ("left", "right")}
-    if options.right and options.left_prefix:
-        raise ValueError("--right goes with --right-prefix, not with --left-prefix")
     return {"right" if options.right or options.right_prefix else "left": out}
 
 

@@ -360,7 +360,9 @@ def test_two_subjects_of_one_file_are_two_hands(
     (tmp_path / "both.csv").write_text(text.replace("L_", "Left:").replace("R_", "Right:"))
     options = ["--left-prefix", "Left:", "--right-prefix", "Right:"]
     assert f"see {' '.join(options)}\n" in refused(["track", "both.csv", "-o", "out.csv"], capsys)
-    assert main(["track", "both.csv", "-o", "out.csv", *options]) == 0
+    asked = ["track", "both.csv", "-o", "out.csv", *options]
+    assert "--right says nothing beside" in refused([*asked, "--right"], capsys)
+    assert main(asked) == 0
     assert main(["track", take, "-o", "one.csv"]) == 0
     assert (tmp_path / "out_left.csv").read_text() == (tmp_path / "one.csv").read_text()
 

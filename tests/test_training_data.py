@@ -120,6 +120,30 @@ def test_unit_and_side_are_said_of_recordings_and_takes_of_what_is_not_simulated
     assert told == {"recordings:y@3": expected}
 
 
+@pytest.mark.usefixtures("made")
+@pytest.mark.parametrize(
+    ("used", "said"),
+    [
+        (("a", "b", "c", "d"), "; e left to test on"),
+        (("a", "e"), "; `jaxhand evaluate` would test on e, too: name others by its --test"),
+    ],
+)
+def test_what_is_left_to_test_on_is_said(
+    used: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for take in "abcde":
+        (tmp_path / f"{take}_left.csv").touch()
+    dataset = make_dataset("own", TRAINING, 1.0, 1.0)
+    sequences = [
+        replace(sequence, take=take)
+        for sequence, take in zip(dataset.sequences, used, strict=False)
+    ]
+    dataset = replace(dataset, sequences=tuple(sequences))
+    monkeypatch.setattr(training_data, "load", lambda *_, **__: dataset)
+    given = training_data.collect(replace(CONFIG, data=(f"recordings:{tmp_path}",)))
+    assert given.notes[0].endswith(f" to validate{said}")
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
