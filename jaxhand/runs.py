@@ -14,6 +14,9 @@ import orbax.checkpoint as orbax
 OWN = ("config.json", "metrics.jsonl", "checkpoints", "model.npz")
 """What a run's folder holds."""
 
+DIGEST = "digest"
+"""Beside the config: of what its paths held."""
+
 FREE = ("out", "epochs", "resume", "overwrite")
 """What may differ when a run is gone on with: it leaves the numbers of every epoch alone."""
 
@@ -42,6 +45,11 @@ def check(folder: Path, config: Mapping[str, Any]) -> None:
         raise ValueError(f"{folder} holds no run to resume: pass another --out")
     before = json.loads((folder / "config.json").read_text("utf-8"))
     for name, now in config.items():
+        if name == DIGEST and before.get(name) != now:
+            raise ValueError(
+                f"{folder} was trained on other files than lie under the same paths now "
+                "(recordings, --hand, --start or --occlusions): pass another --out"
+            )
         if name not in FREE and before.get(name) != now:
             raise ValueError(f"{folder} was trained with {name} {before.get(name)}, not {now}")
 

@@ -437,9 +437,12 @@ def train(config: TrainingConfig) -> Model:
     if not config.data:
         raise ValueError("name a data set to train on: --data NAME:PATH")
     console = Console(soft_wrap=True, highlight=False)
-    runs.check(config.out, _plain(config))
+    plain = _plain(config)
+    runs.check(config.out, plain)
     given = collect(config)
-    runs.create(config.out, _plain(config))
+    plain[runs.DIGEST] = given.digest
+    runs.check(config.out, plain)
+    runs.create(config.out, plain)
 
     def report(m: Metrics) -> None:
         left = timedelta(seconds=round((config.epochs - m.epoch) * m.seconds))

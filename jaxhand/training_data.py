@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Collection
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -43,6 +46,8 @@ class Given(NamedTuple):
     """To go on from."""
     notes: tuple[str, ...]
     """What the user should know, one line each."""
+    digest: str
+    """Of what lay under the config's paths; what is simulated its seed says."""
 
 
 def collect(config: TrainingConfig) -> Given:
@@ -74,7 +79,23 @@ def collect(config: TrainingConfig) -> Given:
     else:
         key = jax.random.key(config.seed)
         sequences = simulation.sequences(key, hand, PEOPLE, SECONDS)
-    return Given(hand, training, validation, joint_frames, sequences, start, tuple(notes))
+    digest = _digest(config, hand, recorded + held_out)
+    return Given(hand, training, validation, joint_frames, sequences, start, tuple(notes), digest)
+
+
+def _digest(config: TrainingConfig, hand: Hand, datasets: list[Dataset]) -> str:
+    """The hand's markers, the takes with their lengths and gaps, and the bytes of files that are
+    not recordings: what another release of a library reads alike."""
+    said: list[Any] = [hand.markers, np.round(hand.offsets, 6).tolist()]
+    for dataset in datasets:
+        said.append([dataset.name, dataset.weight])
+        said += [
+            [s.name, len(s.markers), int(np.isfinite(s.markers).sum())] for s in dataset.sequences
+        ]
+    for path in (config.start, config.occlusions):
+        if isinstance(path, str | Path) and Path(path).is_file():
+            said.append(hashlib.sha256(Path(path).read_bytes()).hexdigest())
+    return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:16]
 
 
 def _takes(dataset: Dataset) -> str:

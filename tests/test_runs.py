@@ -26,6 +26,10 @@ def test_a_used_folder_is_refused_unless_told_what_to_do(tmp_path: Path) -> None
         runs.check(tmp_path / "new", plain(resume=True, seed=1))
     with pytest.raises(ValueError, match="no run to resume"):
         runs.check(tmp_path, plain(resume=True))
+    runs.create(tmp_path / "new", plain(digest="a"))
+    runs.check(tmp_path / "new", plain(resume=True, digest="a"))
+    with pytest.raises(ValueError, match=r"trained on other files .* pass another --out"):
+        runs.check(tmp_path / "new", plain(resume=True, digest="b"))
 
 
 def test_only_a_run_that_is_there_is_gone_on_with(tmp_path: Path) -> None:

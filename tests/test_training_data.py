@@ -144,6 +144,34 @@ def test_what_is_left_to_test_on_is_said(
     assert given.notes[0].endswith(f" to validate{said}")
 
 
+@pytest.mark.usefixtures("made")
+def test_other_files_under_the_same_paths_are_noticed(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    start, gaps = tmp_path / "start.npz", tmp_path / "gaps.json"
+    held = {"dataset": make_dataset("own", TRAINING, 1.0, 1.0)}
+    monkeypatch.setattr(training_data, "load", lambda *_, **__: held["dataset"])
+    model_file.save(model_file.Model(HAND, "affine"), start)
+    gaps.write_text("one")
+    config = replace(CONFIG, data=("recordings:x",), start=start, occlusions=str(gaps))
+
+    def digest() -> str:
+        return training_data.collect(config).digest
+
+    before = digest()
+    assert digest() == before
+    gaps.write_text("two")
+    other_gaps = digest()
+    model_file.save(model_file.Model(HAND, "last_known"), start, overwrite=True)
+    other_start = digest()
+    first = held["dataset"].sequences[0]
+    blind = first.markers.copy()
+    blind[3, 2] = np.nan
+    sequences = (replace(first, markers=blind), *held["dataset"].sequences[1:])
+    held["dataset"] = replace(held["dataset"], sequences=sequences)
+    assert len({before, other_gaps, other_start, digest()}) == 4
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
