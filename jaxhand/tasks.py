@@ -100,14 +100,24 @@ def _occluded_inputs(
     key: Array,
     markers: Array,
     hand: Hand,
+    sizes: float,
     simulated: float,
     occlusions: Array | Occlusions,
     network: Network,
 ) -> tuple[Array, Array]:
+    if sizes:
+        markers = _resized(jax.random.fold_in(key, 2), markers, sizes)
     if simulated:
         markers, _ = _renewed(jax.random.fold_in(key, 1), hand, simulated, markers)
     template = jnp.asarray(hand.template, jnp.float32)
     return _scaled(network, *occlude(key, markers, template, occlusions))
+
+
+def _resized(key: Array, markers: Array, spread: float) -> Array:
+    """The frames as larger and smaller people would have made them; where registration puts them
+    does not depend on the point they grow from."""
+    grown = jnp.exp(spread * jax.random.normal(key, (len(markers), 1, 1), markers.dtype))
+    return grown * markers
 
 
 @partial(jax.jit, static_argnames=("hand", "share"))
@@ -149,11 +159,14 @@ def marker_task(
     hidden: Spec,
     occlusions: tuple[float, ...] | Occlusions,
     start: Network | None = None,
+    sizes: float = 0.0,
 ) -> Task:
     """The marker network: registered visible markers → all markers, in the same frame.
 
     Markers that were not measured count for nothing, neither as inputs nor as targets. `start`: the
-    network to go on from, instead of a new one with layers `hidden`.
+    network to go on from, instead of a new one with layers `hidden`. `sizes`: in every epoch each
+    frame that is not simulated is of another size, by as much as a standard deviation, as a part
+    of 1.
     """
     template = jnp.asarray(hand.template, jnp.float32)
     markers, held_out = (jnp.asarray(x.markers, jnp.float32) for x in (training, validation))
@@ -163,6 +176,7 @@ def marker_task(
     hide = partial(
         _occluded_inputs,
         hand=hand,
+        sizes=sizes,
         simulated=training.simulated,
         occlusions=how,
         network=replace(network, arrays={}),
