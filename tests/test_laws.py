@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -34,6 +34,7 @@ from jaxhand.strategies import (
     visibility,
 )
 from jaxhand.trial import extents
+from numpy_infer import HandTracker
 from numpy_infer.hand import hand_from_json, load_hand
 from numpy_infer.model import Model
 from numpy_infer.pose import DETERMINED_EXTENT
@@ -205,6 +206,102 @@ def test_outputs_that_are_not_the_caller_s_or_not_finite_are_caught() -> None:
         laws.run(Broken(lock), stream)
     with pytest.raises(AssertionError, match="markers in frame 0: not finite"):
         laws.run(Broken(spill), stream)
+
+
+class Own(Broken):
+    """Has a way of its own with what it gives, is given and keeps."""
+
+    def __init__(self, way: Callable[[Any, Any, Any, Array, Array], tuple[Any, Any]]) -> None:
+        super().__init__(nothing)
+        self.way = way
+
+    def step(self, state: Any, markers: Array, visible: Array, dt: Array) -> tuple[Any, Any]:
+        own = markers.copy()
+        after, pose = super().step(getattr(state, "inner", state), own, visible, dt)
+        return self.way(state, after, pose, markers, visible)
+
+
+class Kept(NamedTuple):
+    """A state, and something that should not be in it."""
+
+    inner: Any
+    more: Any
+
+
+class Outputs:
+    """Gives the same array back in every frame."""
+
+    markers = np.zeros((9, 3))
+
+    def __call__(self, state: Any, after: Any, pose: Any, *given: Array) -> tuple[Any, Any]:
+        if pose.markers.shape != self.markers.shape:
+            return after, pose
+        self.markers[...] = pose.markers
+        return after, pose._replace(markers=self.markers)
+
+
+def writes_what_it_is_given(
+    state: Any, after: Any, pose: Any, markers: Array, visible: Array
+) -> tuple[Any, Any]:
+    markers[np.isnan(markers)] = 0
+    return after, pose
+
+
+@pytest.mark.parametrize(
+    ("way", "said"),
+    [
+        (lambda s, a, p, m, v: (Kept(a, p.markers[..., :2]), p), "holds the markers given back in"),
+        (lambda s, a, p, m, v: (Kept(a, m[::-1]), p), "the state holds the markers given in frame"),
+        (lambda s, a, p, m, v: (Kept(a, v), p), "the state holds the visible given in frame 0"),
+        (Outputs(), "the markers given back in frame 0 change in frame 1"),
+        (writes_what_it_is_given, "step changes the markers that it is given, in frame"),
+    ],
+    ids=["a view of an output", "an input", "what is visible", "one array for all", "writes"],
+)
+def test_what_is_the_caller_s_own_stays_so(way: Any, said: str) -> None:
+    with pytest.raises(AssertionError, match=f"law 'prefix': .*{said}"):
+        laws.check_all(Own(way), laws="prefix", examples=20, seed=0)
+
+
+def test_what_is_kept_beside_the_state_is_told_as_such() -> None:
+    calls = [0]
+
+    def way(state: Any, after: Any, pose: Any, *given: Array) -> tuple[Any, Any]:
+        calls[0] += 1
+        pose.markers[...] += 1e-3 * (calls[0] == 40)
+        return after, pose
+
+    with pytest.raises(AssertionError, match=r"law 'prefix': .*keeps something besides its state"):
+        laws.check_all(Own(way), laws="unchanged", examples=20, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("way", "said"),
+    [
+        (lambda s, a, p, m, v: (a, tuple(p)), "a tuple came back from step, without markers"),
+        (lambda s, a, p, m, v: (a, {"markers": p.markers}), "a dict came back from step"),
+        (lambda s, a, p, m, v: (a, p._replace(state=None)), "came back from step, without state"),
+        (
+            lambda s, a, p, m, v: (a, p._replace(markers=p.markers[..., :8, :])),
+            r"markers: expected shape \(9, 3\), received \(8, 3\)",
+        ),
+    ],
+    ids=["a tuple", "a dict", "no state", "eight markers"],
+)
+def test_an_output_that_is_none_is_refused_by_name(way: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        laws.check_all(Own(way), examples=1)
+
+
+@pytest.mark.parametrize("thing", [HandTracker.load(), Model(GLOVE), "glove9", laws.tracker])
+def test_what_is_no_tracker_is_told_how_to_be_one(thing: Any) -> None:
+    with pytest.raises(ValueError, match=r"has no (hand|init).*laws\.tracker\(model\) makes"):
+        laws.check_all(thing)
+
+
+def test_that_no_bit_may_differ_is_said() -> None:
+    with pytest.raises(AssertionError, match=r"off by [\d.]+ mm, where no bit may differ"):
+        laws.check_all(Broken(by_a_filter), laws="unchanged", examples=5, seed=0)
 
 
 # -- what obeys ---------------------------------------------------------------------------------
