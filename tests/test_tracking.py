@@ -11,10 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from numpy_infer import HandTracker, Model, Notice, Status, TrackingState, load_hand, wearer
+from numpy_infer import (
+    HandTracker,
+    Model,
+    Notice,
+    Status,
+    TrackingState,
+    load_hand,
+    tracking,
+    wearer,
+)
 from numpy_infer.cli import describe, main, parser
 from numpy_infer.geometry import mirror
 from numpy_infer.labels import prefixed
+from numpy_infer.model import load
 from numpy_infer.recordings import Recording, read, write
 from numpy_infer.tracking import track, track_hands
 
@@ -56,6 +66,16 @@ def test_offline_equals_live() -> None:
     ]
     assert np.abs(tracked.recording.markers - [pose.markers for pose in live]).max() < 1e-9
     assert (tracked.status == np.array([pose.status for pose in live])).all()
+
+
+def test_a_long_recording_is_tracked_without_keeping_what_is_not_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kept = []
+    monkeypatch.setattr(tracking, "_tracked", lambda recording, model, poses: kept.extend(poses))
+    track(recording_with_gaps(), load("glove9"))
+    assert all(pose.rotations is None and pose.positions is None for pose in kept)
+    assert all(pose.angles is not None for pose in kept)
 
 
 def test_a_rigid_hand_is_filled_exactly_by_the_affine_baseline() -> None:
