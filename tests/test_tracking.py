@@ -193,9 +193,9 @@ def test_what_is_no_array_of_numbers_is_refused_by_name(markers: Any) -> None:
 )
 def test_markers_may_come_in_any_array(given: Callable[[Array], Any]) -> None:
     plain, other = HandTracker(Model(HAND)), HandTracker(Model(HAND))
-    for markers in recording_with_gaps().markers[:40]:
+    for markers in recording_with_gaps().markers[30:70]:
         expected, found = plain.step(markers, 1 / 60), other.step(given(markers), 1 / 60)
-        assert (found.markers == expected.markers).all()
+        assert np.allclose(found.markers, expected.markers, rtol=0, atol=1e-12)  # Fortran's order
         assert (found.status == expected.status).all()
 
 
