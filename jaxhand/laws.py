@@ -290,7 +290,7 @@ def check_batch(
     metres: float = METRES,
     radians: float = RADIANS,
 ) -> None:
-    """Any number of hands equals one at a time, left and right mixed.
+    """Any number of hands equals one at a time, left and right mixed. All are there twice.
 
     Args:
         tracker: what is checked; `init` takes the leading shape.
@@ -300,17 +300,22 @@ def check_batch(
     """
     hands = stream.visible.shape[1]
     right = np.arange(hands) % 2 == 1 if right is None else right
-    together = run(tracker, stream, right=right).poses
+    twice = Stream(*(np.concatenate([a, a], 1) for a in stream))
+    together = run(tracker, twice, right=np.concatenate([right, right])).poses
     folded = Stream(*(a.reshape(len(a), 1, *a.shape[1:]) for a in stream))
     square = run(tracker, folded, right=right[None]).poses
     for hand in range(hands):
         alone = Stream(*(a[:, hand] for a in stream))
         one = run(tracker, alone, right=right[hand]).poses
-        trial = Trial(f"batch, hand {hand} of {hands}", tracker, alone)
-        for many in (
-            {k: v[:, hand] for k, v in together.items()},
-            {k: v[:, 0, hand] for k, v in square.items()},
+        for of, many in (
+            (f"{hand} of {2 * hands}", {k: v[:, hand] for k, v in together.items()}),
+            (
+                f"{hand + hands} of {2 * hands}",
+                {k: v[:, hand + hands] for k, v in together.items()},
+            ),
+            (f"{hand} of {hands}", {k: v[:, 0, hand] for k, v in square.items()}),
         ):
+            trial = Trial(f"batch, hand {of}", tracker, alone)
             trial.same(many, one, ("state", "status", "notice"))
             trial.same(many, one, (*PLACES, "expected_error"), within=metres)
             trial.same(many, one, ("angles", *TURNS), within=radians)
