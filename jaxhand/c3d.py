@@ -38,6 +38,11 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     return recording.reflected() if left_handed else recording
 
 
+def check() -> None:
+    """Raises, before any work, what `write` would raise after it: ezc3d is not installed."""
+    _ezc3d()
+
+
 def write(recording: Recording, path: Path) -> None:
     """Write float32 millimetres; gaps get residual −1.
 

@@ -1,7 +1,9 @@
 """The laws that any tracker of hands should obey, as functions for anyone's own tests.
 
-A tracker is anything with `hand`, `init` and `step`; `tracker(model)` makes one of a model. Each
-`check_…` takes a tracker and a stream, and raises AssertionError with the law, marker, frame and
+A tracker is anything with `hand`, `init` and `step`, see `trial.Tracker`: `init(batch, right)`
+gives a state, `step(state, markers, visible, dt)` a state and an output with the attributes
+`markers` and `state`, and what else of a `HandPose` it has. `tracker(model)` makes one of a model.
+Each `check_…` takes a tracker and a stream, and raises AssertionError with law, marker, frame and
 size of what is wrong. `check_all` lets Hypothesis look for a small stream that breaks a law:
 
     laws.check_all(laws.tracker(Model(load_hand("glove9"), "mine")))
@@ -288,7 +290,7 @@ def check_batch(
     metres: float = METRES,
     radians: float = RADIANS,
 ) -> None:
-    """Any number of hands equals one at a time, left and right mixed.
+    """Any number of hands equals one at a time, left and right mixed. All are there twice.
 
     Args:
         tracker: what is checked; `init` takes the leading shape.
@@ -298,17 +300,22 @@ def check_batch(
     """
     hands = stream.visible.shape[1]
     right = np.arange(hands) % 2 == 1 if right is None else right
-    together = run(tracker, stream, right=right).poses
+    twice = Stream(*(np.concatenate([a, a], 1) for a in stream))
+    together = run(tracker, twice, right=np.concatenate([right, right])).poses
     folded = Stream(*(a.reshape(len(a), 1, *a.shape[1:]) for a in stream))
     square = run(tracker, folded, right=right[None]).poses
     for hand in range(hands):
         alone = Stream(*(a[:, hand] for a in stream))
         one = run(tracker, alone, right=right[hand]).poses
-        trial = Trial(f"batch, hand {hand} of {hands}", tracker, alone)
-        for many in (
-            {k: v[:, hand] for k, v in together.items()},
-            {k: v[:, 0, hand] for k, v in square.items()},
+        for of, many in (
+            (f"{hand} of {2 * hands}", {k: v[:, hand] for k, v in together.items()}),
+            (
+                f"{hand + hands} of {2 * hands}",
+                {k: v[:, hand + hands] for k, v in together.items()},
+            ),
+            (f"{hand} of {hands}", {k: v[:, 0, hand] for k, v in square.items()}),
         ):
+            trial = Trial(f"batch, hand {of}", tracker, alone)
             trial.same(many, one, ("state", "status", "notice"))
             trial.same(many, one, (*PLACES, "expected_error"), within=metres)
             trial.same(many, one, ("angles", *TURNS), within=radians)
@@ -399,7 +406,7 @@ def check_all(
     seed: int | None = None,
     carried: bool = False,
     twin: Tracker | None = None,
-    laws: Collection[str] | None = None,
+    laws: Collection[str] | str | None = None,
     frames: int = 16,
     metres: float = METRES,
     radians: float = RADIANS,
@@ -414,16 +421,22 @@ def check_all(
         carried: also that a fixed posture is filled exactly, and goes with a hand that comes back;
             see `check_carried`.
         twin: another tracker that must say the same; see `check_parity`.
-        laws: names in `LAWS`, if not all that apply.
+        laws: names in `LAWS`, or one of them, if not all that apply.
         frames: how many there are at most in a stream.
         metres: tolerance.
         radians: tolerance.
 
     Raises:
         AssertionError: a law is broken.
-        ValueError: no such law.
+        ValueError: no such law, or no tracker.
     """
-    asked = [*LAWS] if laws is None else laws
+    for name in ("hand", "init", "step"):
+        if not hasattr(tracker, name):
+            raise ValueError(
+                f"tracker: a {type(tracker).__name__} has no {name}; laws.tracker(model) makes a "
+                "tracker of a model, such as hand_tracker.model"
+            )
+    asked = [*LAWS] if laws is None else [laws] if isinstance(laws, str) else laws
     if unknown := set(asked) - set(LAWS):
         raise ValueError(f"unknown laws {sorted(unknown)}: expected some of {', '.join(LAWS)}")
     fixed = {"metres": metres, "radians": radians, "all_markers": carried}

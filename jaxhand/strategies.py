@@ -20,8 +20,6 @@ from numpy_infer.geometry import kabsch
 from numpy_infer.hand import ANGLES, HIGH, LOW, POINTS, Hand, bundled, hand_from_json, load_hand
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
-"""`[26]` radians each: the ranges of the joint angles."""
-
 DURATIONS = (1 / 60, 1 / 120, 0.1, 0.003, 0.0)
 """Seconds between frames that are drawn; 0 is a time stamp given twice."""
 

@@ -191,10 +191,13 @@ def check_output(path: Path, *, overwrite: bool) -> None:
         overwrite: it may be there already.
 
     Raises:
-        ValueError: it exists, it is a folder, or it would stand in none.
+        ValueError: it exists, it is a folder, or it would stand in none, or where nothing may be
+            written.
     """
     if not path.parent.is_dir():
         raise ValueError(f"{path.parent} is no folder: make it first")
+    if not os.access(path.parent, os.W_OK | os.X_OK):
+        raise ValueError(f"{path.parent} is a folder that nothing may be written to")
     if path.is_dir():
         raise ValueError(f"{path} is a folder: choose another name")
     if path.exists() and not overwrite:

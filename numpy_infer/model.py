@@ -133,6 +133,10 @@ class Model:
                 f"{', '.join(self.hand.markers)}"
             )
         if self.smoothing is not None:
+            if not isinstance(self.smoothing, Smoothing):
+                raise ValueError(
+                    f"smoothing: expected a Smoothing or None, received {self.smoothing!r}"
+                )
             least, beta, derivative = self.smoothing
             if not (0 < least < inf and 0 <= beta < inf and 0 < derivative < inf):
                 raise ValueError(f"smoothing: expected positive cutoffs, received {self.smoothing}")

@@ -42,7 +42,11 @@ class Notice(IntFlag):
 
     NONE = 0
     NON_POSITIVE_DT = 1
+    """No time has passed, by `dt`: nothing that runs on time moves."""
     SUSPECTED_MILLIMETRES = 2
+    """Markers lie too far apart for metres. They are measurements all the same: where such frames
+    were a passing fault, `HandTracker.reset` after the last, or what was made of them is led back
+    at 25 cm/s."""
     REJECTED_MARKERS = 4
     """The gate refused some; `Status.REJECTED` says which."""
 
@@ -68,9 +72,10 @@ class HandPose(NamedTuple):
     positions: Array | None
     """`[..., 21, 3]` joints and tips; None without a joint stage."""
     state: Array
-    """`[...]` a `TrackingState`."""
+    """`[...]` a `TrackingState`, as a number in an array: compare it by `==`, or name that of one
+    hand by `TrackingState(pose.state)`."""
     notice: Array
-    """`[...]` flags of `Notice`."""
+    """`[...]` flags of `Notice`, likewise: `pose.notice & Notice.REJECTED_MARKERS`."""
 
     @property
     def quaternions(self) -> Array | None:

@@ -267,9 +267,17 @@ def median_rate(time: np.ndarray, source: object) -> float:
 
 
 def doubted_time(recording: Recording) -> str | None:
-    """What is to be said of a recording whose frames are too far apart for seconds; or None."""
+    """What is to be said of a recording whose frames are too far apart for seconds, or as no frames
+    are at the rate that the file states; or None."""
     steps = np.diff(recording.time)
     step = float(np.median(steps)) if steps.size else 0.0
+    # Rounded times spoil the median, frames left out the mean.
+    ways = np.array([step, steps.mean()]) * recording.rate if steps.size else np.ones(2)
+    if 0 < step <= 1 / SLOWEST and (np.abs(ways - 1) > 0.1).all():
+        return (
+            f"the file states {recording.rate:g} Hz, but its time goes on by {1e3 * step:.3g} ms a "
+            f"frame, {1 / step:.4g} Hz: the time is believed"
+        )
     if step <= 1 / SLOWEST:
         return None
     return (
@@ -294,13 +302,16 @@ def _reader(path: Path, format: str | None) -> ModuleType:
 
 
 def writer_of(path: Path) -> ModuleType:
-    """What writes files with this suffix; ValueError if nothing does."""
+    """What writes files with this suffix; ValueError if nothing does, or it lacks a library."""
     plugins = _plugins()
     suffix = path.suffix.lower()
     if suffix in WRITER_OF:
         return _module(WRITER_OF[suffix], plugins)
     if suffix[1:] in plugins:
-        return _module(suffix[1:], plugins)
+        module = _module(suffix[1:], plugins)
+        if hasattr(module, "check"):
+            module.check()
+        return module
     known = sorted({*WRITER_OF, *(f".{name}" for name in plugins)})
     raise ValueError(f"{path}: cannot write {suffix!r}; known: {', '.join(known)}")
 

@@ -202,6 +202,22 @@ def _cleaned(
     return markers, visible, elapsed, late
 
 
+_FLOAT64 = np.dtype(np.float64)
+
+
+def _numbers(markers: Array, expected: tuple[int, ...]) -> Array:
+    """Whatever stands for markers as an array of floats, NaN where it is masked."""
+    try:
+        if isinstance(markers, np.ma.MaskedArray):
+            return np.ma.filled(markers.astype(np.float64), np.nan)
+        return np.asarray(markers, np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"markers: expected numbers of shape {expected}, three NaN for a hidden marker, "
+            f"received a {type(markers).__name__} that does not make such an array"
+        ) from None
+
+
 class HandTracker:
     """One hand, or several of one model, frame by frame: `init` and `step` with the state inside.
 
@@ -212,10 +228,19 @@ class HandTracker:
         """`right`: True for a right hand; a sequence, one entry a hand, for several hands.
 
         Raises:
-            ValueError: the model's predictor is not known.
+            ValueError: no `Model`, its predictor is not known, or a side that is neither.
         """
+        if not isinstance(model, Model):
+            raise ValueError(
+                f"model: expected a Model, received a {type(model).__name__}; HandTracker.load "
+                "takes a file, or a bundled model's name"
+            )
         self.model = model
-        self._right = np.asarray(right, bool)
+        self._right = np.asarray(right)
+        if self._right.dtype != bool:  # any text would count as True
+            raise ValueError(
+                f"right: expected True or False, or one of them for each hand, received {right!r}"
+            )
         self._state = init(model, self._right.shape, self._right)
         self._all = np.ones((*self._right.shape, len(model.hand)), bool)
 
@@ -258,15 +283,18 @@ class HandTracker:
 
         Args:
             markers: `[M, 3]` (several hands: `[hands, M, 3]`) metres, world, in the order of
-                `hand.markers`; NaN where a marker is hidden.
-            dt: seconds since the previous frame.
-            visible: `[M]` True where measured, if NaN is not to say it.
+                `hand.markers`; NaN, or a masked array's mask, where a marker is hidden, and all of
+                a hand that is away.
+            dt: seconds since the previous frame; `[hands]` if each has its own.
+            visible: `[M]` (several hands: `[hands, M]`) True where measured, if NaN is not to say
+                it.
 
         Raises:
-            ValueError: a wrong shape. Wrong data never raise; they show in the output's `state`,
-                `status` and `notice`.
+            ValueError: a wrong shape, or no numbers. Wrong data never raise; they show in the
+                output's `state`, `status` and `notice`.
         """
-        markers = np.asarray(markers, np.float64)
+        if type(markers) is not np.ndarray or markers.dtype is not _FLOAT64:
+            markers = _numbers(markers, (*self._all.shape, 3))
         expected = self._all.shape
         if markers.shape != (*expected, 3):
             raise ValueError(f"markers: expected shape {(*expected, 3)}, received {markers.shape}")

@@ -96,6 +96,16 @@ def test_an_output_is_refused_if_it_exists_unless_it_may_be_replaced(tmp_path: P
     check_output(Path("here.json"), overwrite=False)
 
 
+def test_a_folder_that_may_not_be_written_to_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+    monkeypatch.setattr(os, "access", lambda path, mode: asked.append(path))
+    with pytest.raises(ValueError, match="is a folder that nothing may be written to"):
+        check_output(tmp_path / "out.csv", overwrite=False)
+    assert asked == [tmp_path]
+
+
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     assert main(arguments) == 2
     error = capsys.readouterr().err

@@ -203,6 +203,22 @@ DAMAGE = [
     ("take.tsv", "5\t7", "5\t1_0", 10, "column 8: expected a number, found '1_0'"),
     ("take.tsv", TSV[TSV.index("Frame") :], "", 7, "ends inside its header"),
     ("take.csv", "time", "frame", 2, "expected the first column to be time"),
+    (
+        "take.csv",
+        CSV[CSV.index("time") :],
+        CSV[CSV.index("time") :].replace(",", ";"),
+        2,
+        "by ';', not by",
+    ),
+    ("take.csv", "time", "\ntime", 2, "the line is empty where the header should be"),
+    ("take.csv", CSV, "a letter\n", 1, "expected the first column to be time, found 'a letter'"),
+    (
+        "take.trc",
+        TRC[: TRC.index("Frame#")],
+        TRC[: TRC.index("Frame#")].replace("\t", " "),
+        3,
+        "expected tabs",
+    ),
     ("take.csv", "unit: mm", "unit: hand", 1, "unknown unit 'hand'"),
     ("take.csv", ".deg", ".angle", 2, "unknown column 'thumb_flexion.angle'"),
     ("take.csv", "b.z", "a.z", 2, "duplicate column 'a.z'"),
@@ -370,7 +386,7 @@ def test_plain_csv_notes_the_angles_that_it_skips(put: Callable) -> None:
 
 def test_plain_csv_of_one_frame_needs_a_rate(put: Callable) -> None:
     one = "# unit: m\ntime,a.x,a.y,a.z\n0,1,2,3\n"
-    with pytest.raises(ValueError, match="no rate"):
+    with pytest.raises(ValueError, match=r"no rate: .* a line '# rate: 60' before the header"):
         read(put("take.csv", one))
     assert read(put("take.csv", "# rate: 50\n" + one)).rate == 50
 

@@ -17,7 +17,7 @@ from numpy_infer import recordings
 from numpy_infer.formats import plain_csv, qualisys, trc
 from numpy_infer.formats.authors import read_hand_csv
 from numpy_infer.pose import Status
-from numpy_infer.recordings import JointTruth, Recording, median_rate, read, write
+from numpy_infer.recordings import JointTruth, Recording, median_rate, read, write, writer_of
 
 # Metres lost by writing and reading: CSV keeps every digit, TRC and TSV nanometres, C3D float32.
 PRECISION = {".csv": 0.0, ".trc": 2e-9, ".tsv": 2e-9, ".c3d": 2e-6}
@@ -427,6 +427,14 @@ def test_c3d_without_ezc3d_says_what_to_install(
     monkeypatch.setitem(sys.modules, "ezc3d", None)
     with pytest.raises(ValueError, match=r"pip install 'jaxhand\[c3d\]'"):
         c3d.read(tmp_path / "take.c3d")
+
+
+def test_c3d_without_ezc3d_is_refused_before_the_work(
+    monkeypatch: pytest.MonkeyPatch, c3d_declared: None
+) -> None:
+    monkeypatch.setitem(sys.modules, "ezc3d", None)
+    with pytest.raises(ValueError, match=r"pip install 'jaxhand\[c3d\]'"):
+        writer_of(Path("filled.c3d"))
 
 
 @NEEDS_EZC3D

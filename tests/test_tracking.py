@@ -3,18 +3,32 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from numpy_infer import HandTracker, Model, Status, TrackingState, load_hand, wearer
+from numpy_infer import (
+    HandTracker,
+    Model,
+    Notice,
+    Status,
+    TrackingState,
+    load_hand,
+    tracking,
+    wearer,
+)
 from numpy_infer.cli import describe, main, parser
 from numpy_infer.geometry import mirror
 from numpy_infer.labels import prefixed
+from numpy_infer.model import load
 from numpy_infer.recordings import Recording, read, write
 from numpy_infer.tracking import track, track_hands
+
+Array = np.ndarray
 
 HAND = load_hand("glove9")
 
@@ -52,6 +66,16 @@ def test_offline_equals_live() -> None:
     ]
     assert np.abs(tracked.recording.markers - [pose.markers for pose in live]).max() < 1e-9
     assert (tracked.status == np.array([pose.status for pose in live])).all()
+
+
+def test_a_long_recording_is_tracked_without_keeping_what_is_not_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    kept = []
+    monkeypatch.setattr(tracking, "_tracked", lambda recording, model, poses: kept.extend(poses))
+    track(recording_with_gaps(), load("glove9"))
+    assert all(pose.rotations is None and pose.positions is None for pose in kept)
+    assert all(pose.angles is not None for pose in kept)
 
 
 def test_a_rigid_hand_is_filled_exactly_by_the_affine_baseline() -> None:
@@ -142,6 +166,72 @@ def test_a_wrong_shape_raises_and_wrong_data_do_not() -> None:
     pose = tracker.step(np.full((9, 3), np.nan), float("nan"))
     assert np.isfinite(pose.markers).all()
     assert pose.state == TrackingState.LOST
+
+
+@pytest.mark.parametrize(
+    "markers",
+    [[None, *HAND.template[1:].tolist()], "nine markers", {"wrist": [0, 0, 0]}, [[0, 0, "x"]] * 9],
+    ids=["a hole in a list", "text", "names", "a word"],
+)
+def test_what_is_no_array_of_numbers_is_refused_by_name(markers: Any) -> None:
+    with pytest.raises(ValueError, match=r"markers: expected numbers of shape \(9, 3\), .*hidden"):
+        HandTracker(Model(HAND)).step(markers, 1 / 60)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        lambda x: x.tolist(),
+        lambda x: [[v if v == v else None for v in row] for row in x.tolist()],
+        np.asfortranarray,
+        lambda x: x.astype(">f8"),
+        lambda x: x.astype(object),
+        lambda x: np.ma.masked_array(np.nan_to_num(x), np.isnan(x)),
+        lambda x: np.ma.masked_array(np.where(np.isnan(x), 7, x), np.isnan(x)),
+    ],
+    ids=["list", "None", "Fortran", "big-endian", "objects", "masked zeros", "masked values"],
+)
+def test_markers_may_come_in_any_array(given: Callable[[Array], Any]) -> None:
+    plain, other = HandTracker(Model(HAND)), HandTracker(Model(HAND))
+    for markers in recording_with_gaps().markers[30:70]:
+        expected, found = plain.step(markers, 1 / 60), other.step(given(markers), 1 / 60)
+        assert np.allclose(found.markers, expected.markers, rtol=0, atol=1e-12)  # Fortran's order
+        assert (found.status == expected.status).all()
+
+
+@pytest.mark.parametrize("right", ["left", ["left", "right"], None, 2, []])
+def test_a_side_is_true_or_false(right: Any) -> None:
+    with pytest.raises(ValueError, match=r"right: expected True or False.*received"):
+        HandTracker(Model(HAND), right=right)
+
+
+def test_a_tracker_is_made_of_a_model() -> None:
+    with pytest.raises(ValueError, match=r"expected a Model, received a str; HandTracker\.load"):
+        HandTracker("glove9")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="smoothing: expected a Smoothing or None, received True"):
+        HandTracker.load(smoothing=True)  # type: ignore[arg-type]
+
+
+def test_a_passing_fault_in_the_unit_is_forgotten_by_a_reset() -> None:
+    kept, reset = HandTracker.load(), HandTracker.load()
+    # So shaky a hand is one whose markers the gate refuses if it is a thousand times as large.
+    walk = np.random.default_rng(0).normal(size=(65, 1, 3)).cumsum(0) * 2e-3
+    size = 1 + 0.1 * np.sin(np.arange(65) / 30)[:, None, None]
+    for i, frame in enumerate(size * HAND.template + walk + [0, 1, 0]):
+        wrong = 50 <= i < 60
+        if i == 60:
+            reset.reset()
+        one, other = (t.step(frame * (1000 if wrong else 1), 1 / 60) for t in (kept, reset))
+        assert bool(one.notice & Notice.SUSPECTED_MILLIMETRES) == wrong
+    assert np.abs(one.markers - frame).max() > 1
+    assert (other.markers == frame).all()
+
+
+def test_a_state_is_compared_and_named_as_it_says() -> None:
+    pose = HandTracker(Model(HAND)).step(HAND.template, 1 / 60)
+    assert pose.state == TrackingState.TRACKING
+    assert TrackingState(pose.state).name == "TRACKING"
+    assert not pose.notice & Notice.REJECTED_MARKERS
 
 
 def test_several_hands_are_several_trackers() -> None:

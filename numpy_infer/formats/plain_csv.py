@@ -9,14 +9,16 @@
 
 Comment lines come first; `unit` must be there or be given, `rate` and `frames` are optional. A
 blank or NaN cell is a gap; so are three exact zeros in a file whose markers jump there, unless it
-says `# gaps: blank`, as those that we write do. Of what tracking adds `NAME.status` is read, where
-numbers other than 0 say that the marker was filled, and the rest with a note alone: columns that
-end in `.deg` (joint angles) or `.pose`, and of each marker `NAME.expected_error`, in the file's
-unit. The markers of a file that we write read back bit for bit.
+says `# gaps: blank`, as those that we write do. Quotes about cells are left out. Of what tracking
+adds `NAME.status` is read, where numbers other than 0 say that the marker was filled, and the rest
+with a note alone: columns that end in `.deg` (joint angles) or `.pose`, and of each marker
+`NAME.expected_error`, in the file's unit. The markers of a file that we write read back bit for
+bit.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,11 +47,12 @@ WRIST = tuple(f"wrist_{part}.pose" for part in ("x", "y", "z", "qx", "qy", "qz",
 def read(path: Path, *, unit: float | None = None, left_handed: bool = False) -> Recording:
     """Read a plain CSV file; ValueError names file and line."""
     file = read_text(path)
+    file = replace(file, lines=[line.replace('"', "") for line in file.lines])
     comments, header = _comments(file)
+    cells = _header(file, header)
+    names, columns, notes = _columns(file, header, cells)
     stated = metres_per(*comments["unit"]) if "unit" in comments else None
     scale = agreed(path, stated, unit)
-    cells = file.unique(header, file.cells(header, ","), "column")
-    names, columns, notes = _columns(file, header, cells)
     status = {
         cell.removesuffix(".status"): i for i, cell in enumerate(cells) if cell.endswith(".status")
     }
@@ -61,7 +64,10 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     if "rate" in comments:
         rate = hertz(positive(*comments["rate"], "rate"), comments["rate"][1], "rate")
     else:
-        rate = median_rate(time, path)
+        try:
+            rate = median_rate(time, path)
+        except ValueError as error:
+            raise ValueError(f"{error}; a line '# rate: 60' before the header does") from None
     positions = table[:, columns] * scale
     blank = comments.get("gaps", ("", ""))[0].lower() == "blank"
     markers, gaps = hide_gaps(positions, zeros=not blank and zeros_are_gaps(positions))
@@ -115,11 +121,11 @@ def write(recording: Recording, path: Path) -> None:
         columns += [f"{name}.expected_error" for name in recording.names]
         expected = np.where(recording.visible, recording.expected_error, np.nan)
         table = np.concatenate([table, expected.round(6)], -1)
-    lines = [*comments, ",".join(["time", *columns])]
-    for time, row in zip(recording.time, table.tolist(), strict=True):
-        cells = ["" if value != value else number(value) for value in row]
-        lines.append(",".join([number(time), *cells]))
-    path.write_text("".join(line + "\n" for line in lines), "utf-8", newline="\n")
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines(line + "\n" for line in (*comments, ",".join(["time", *columns])))
+        for time, row in zip(recording.time, table, strict=True):
+            cells = ["" if value != value else number(value) for value in row.tolist()]
+            file.write(",".join([number(time), *cells]) + "\n")
 
 
 def _comments(file: TextFile) -> tuple[dict[str, tuple[str, str]], int]:
@@ -134,16 +140,31 @@ def _comments(file: TextFile) -> tuple[dict[str, tuple[str, str]], int]:
     raise file.error(len(file.lines), "the file has comments and no header")
 
 
+def _header(file: TextFile, index: int) -> tuple[str, ...]:
+    """The names of all columns."""
+    line = file.lines[index]
+    if not line.strip():
+        raise file.error(
+            index, "the line is empty where the header should be; no empty line may stand between"
+        )
+    cells = file.cells(index, ",")
+    if cells[0] != "time":
+        apart = next((c for c in ";\t" if c in line and "," not in line), None)
+        found = (
+            repr(cells[0]) if apart is None else f"columns separated by {apart!r}, not by commas"
+        )
+        raise file.error(
+            index,
+            f"expected the first column to be time, found {found}; the header is "
+            "time,NAME.x,NAME.y,NAME.z,… for all markers",
+        )
+    return file.unique(index, cells, "column")
+
+
 def _columns(
     file: TextFile, header: int, cells: tuple[str, ...]
 ) -> tuple[tuple[str, ...], np.ndarray, tuple[str, ...]]:
     """Marker names, the [M, 3] columns of their coordinates, and notes about skipped columns."""
-    if cells[0] != "time":
-        raise file.error(
-            header,
-            f"expected the first column to be time, found {cells[0]!r}; the header is "
-            "time,NAME.x,NAME.y,NAME.z,… for all markers",
-        )
     place = {cell: index for index, cell in enumerate(cells)}
     tracked = [cell for cell in cells[1:] if cell.endswith(TRACKED)]
     coordinates = [cell for cell in cells[1:] if not cell.endswith(TRACKED)]

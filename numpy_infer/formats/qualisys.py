@@ -17,10 +17,10 @@ from numpy_infer.formats.table import (
     check_writable,
     hertz,
     hide_gaps,
-    millimetre_rows,
     number,
     positive,
     read_text,
+    write_rows,
 )
 from numpy_infer.formats.units import agreed
 from numpy_infer.recordings import Recording
@@ -76,9 +76,7 @@ def write(recording: Recording, path: Path) -> None:
         ["TRAJECTORY_TYPES", *types],
         ["Frame", "Time", *columns],
     ]
-    for index, row in enumerate(millimetre_rows(recording, gap="NaN")):
-        rows.append([str(index + 1), number(recording.time[index]), *row])
-    path.write_text("".join("\t".join(row) + "\n" for row in rows), "utf-8", newline="\n")
+    write_rows(path, rows, recording, gap="NaN")
 
 
 def _header(file: TextFile) -> tuple[dict[str, tuple[int, list[str]]], int]:

@@ -144,15 +144,20 @@ def check_writable(names: Sequence[str]) -> None:
             )
 
 
-def millimetre_rows(recording: Recording, gap: str) -> list[list[str]]:
-    """T rows of 3·M cells in millimetres with 6 decimals (1 nm)."""
+def write_rows(path: Path, header: Sequence[Sequence[str]], recording: Recording, gap: str) -> None:
+    """Writes a table between tabs: a header's rows, then for each frame its number, its time and
+    3·M cells in millimetres with 6 decimals (1 nm)."""
     millimetres = np.round(recording.markers * 1e3, 6)
     visible = recording.visible
     # These formats read 0 0 0 as a gap: a marker measured there is moved by one nanometre.
     millimetres[..., 0][visible & (millimetres == 0).all(axis=-1)] = 1e-6
     millimetres[~visible] = np.nan
-    rows = millimetres.reshape(len(millimetres), -1).tolist()
-    return [[gap if value != value else f"{value:.6f}" for value in row] for row in rows]
+    rows = millimetres.reshape(len(millimetres), -1)
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.writelines("\t".join(row) + "\n" for row in header)
+        for index, (time, row) in enumerate(zip(recording.time, rows, strict=True)):
+            cells = [gap if value != value else f"{value:.6f}" for value in row.tolist()]
+            file.write("\t".join([str(index + 1), number(time), *cells]) + "\n")
 
 
 def positive(text: str, where: str, what: str) -> float:

@@ -1,7 +1,8 @@
 """TRC: tab-separated marker trajectories (Motion Analysis, OpenSim).
 
 Five header lines: file type, names of the settings, their values, marker labels (one per three
-columns), axis labels. The unit is in the header. A gap is blank, NaN, or three exact zeros.
+columns), axis labels. The unit is in the header, or is given where it is blank there. A gap is
+blank, NaN, or three exact zeros.
 Some files leave out whole frames: their rows stay as they are, and frame numbers and times jump.
 """
 
@@ -16,10 +17,10 @@ from numpy_infer.formats.table import (
     check_writable,
     hertz,
     hide_gaps,
-    millimetre_rows,
     number,
     positive,
     read_text,
+    write_rows,
 )
 from numpy_infer.formats.units import agreed, metres_per
 from numpy_infer.recordings import Recording
@@ -31,13 +32,16 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     if not file.lines[0].startswith("PathFileType"):
         raise file.error(0, "expected a TRC file, which starts with PathFileType")
     settings = _settings(file)
-    scale = agreed(path, metres_per(settings["Units"], file.where(2)), unit)
+    stated = metres_per(settings["Units"], file.where(2)) if settings.get("Units") else None
+    if stated is None and unit is None:
+        raise file.error(2, "the header has no Units: pass --unit mm (cm, m, in)")
+    scale = agreed(path, stated, unit)
     names = _names(file, int(positive(settings["NumMarkers"], file.where(2), "NumMarkers")))
     file.cells(4, "\t")
     first = 6 if len(file.lines) > 5 and not file.lines[5].strip() else 5
     table = file.numbers(first, 2 + 3 * len(names), "\t")
-    stated = int(positive(settings["NumFrames"], file.where(2), "NumFrames"))
-    left_out = _frames_left_out(file, stated, table[:, 0])
+    count = int(positive(settings["NumFrames"], file.where(2), "NumFrames"))
+    left_out = _frames_left_out(file, count, table[:, 0])
     file.check_time(table[:, 1], first)
     rate = hertz(
         positive(settings["DataRate"], file.where(2), "DataRate"), file.where(2), "DataRate"
@@ -79,17 +83,16 @@ def write(recording: Recording, path: Path) -> None:
         ["", "", *axes],
         [],
     ]
-    for index, row in enumerate(millimetre_rows(recording, gap="")):
-        rows.append([str(index + 1), number(recording.time[index]), *row])
-    path.write_text("".join("\t".join(row) + "\n" for row in rows), "utf-8", newline="\n")
+    write_rows(path, rows, recording, gap="")
 
 
 def _settings(file: TextFile) -> dict[str, str]:
     keys, values = file.cells(1, "\t"), file.cells(2, "\t")
     settings = dict(zip(keys, values, strict=False))
-    for key in ("DataRate", "NumFrames", "NumMarkers", "Units"):
+    for key in ("DataRate", "NumFrames", "NumMarkers"):
         if not settings.get(key):
-            raise file.error(2, f"the header has no {key}")
+            tabs = "" if "\t" in file.lines[1] else ": expected tabs between its columns"
+            raise file.error(2, f"the header has no {key}{tabs}")
     return settings
 
 
