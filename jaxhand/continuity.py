@@ -36,6 +36,7 @@ from numpy_infer.continuity import (
     SHRINK_SPEED,
 )
 from numpy_infer.model import Model
+from numpy_infer.output import HUGE
 from numpy_infer.pose import DETERMINED_EXTENT, State
 
 
@@ -170,7 +171,8 @@ def _frame(model: Model, state: State, markers: Array, visible: Array, dt: Array
     correction = jnp.where(sure | known, untransform(*then, last) - again, 0)
 
     length = jnp.sqrt((correction * correction).sum(-1, keepdims=True))
-    correction = jnp.where(length < FARTHEST_CORRECTION, correction, 0)
+    far_apart = ((jnp.abs(measured) > HUGE).any(-1) & visible).any((0, -1))[..., None, None]
+    correction = jnp.where((length < FARTHEST_CORRECTION) & ~far_apart, correction, 0)
     seen = untransform(*now, transform(turn, move, before))
     drift = jnp.where(state.visible, 0, state.drift + state.change[..., None])
     # Hands whose set is the same go on as they were; those seen for the first time begin.

@@ -31,7 +31,7 @@ from numpy_infer.geometry import (
     untransform,
 )
 from numpy_infer.model import Model
-from numpy_infer.output import leading, wrist_pose
+from numpy_infer.output import HUGE, leading, wrist_pose
 from numpy_infer.pose import DETERMINED_EXTENT, State
 from numpy_infer.predictors import PREDICTORS
 from numpy_infer.sight import Sight, sight
@@ -41,7 +41,8 @@ SHRINK_SPEED = 0.25
 
 FARTHEST_CORRECTION = 10.0
 """Metres: an output that is farther off comes of a frame that was no hand's (in millimetres, say),
-and is given up at once rather than for a minute."""
+and is given up at once rather than for a minute. So is, whatever it is, what is missing to the
+output of a frame whose markers are too far apart (`HUGE`), and to that in such a frame."""
 
 DRIFT_UNSEEN = 0.04
 """m/s: how fast the posture is taken to change while nothing determines the hand. In gaps like
@@ -253,6 +254,9 @@ def _unsteady(
         correction = np.where(determined | known, correction, 0)
 
     near = squares(correction) < FARTHEST_CORRECTION**2
+    far_apart = np.abs(measured) > HUGE
+    if np.count_nonzero(far_apart):
+        near = near & ~(far_apart.any(-1) & visible).any((0, -1))[..., None]
     if np.count_nonzero(near) < near.size:
         correction = np.where(near[..., None], correction, 0)
     anchor, prior = measured[1], then[0].swapaxes(-1, -2) @ followed

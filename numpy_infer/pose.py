@@ -44,9 +44,9 @@ class Notice(IntFlag):
     NON_POSITIVE_DT = 1
     """No time has passed, by `dt`: nothing that runs on time moves."""
     SUSPECTED_MILLIMETRES = 2
-    """Markers lie too far apart for metres. They are measurements all the same: where such frames
-    were a passing fault, `HandTracker.reset` after the last, or what was made of them is led back
-    at 25 cm/s."""
+    """Markers lie too far apart for metres. They are measurements all the same; once they are over,
+    nothing is left of them but where a baseline's hidden markers are, `HandTracker.reset` forgets
+    those, too."""
     REJECTED_MARKERS = 4
     """The gate refused some; `Status.REJECTED` says which."""
 
