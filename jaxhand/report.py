@@ -53,7 +53,7 @@ class EvaluationConfig:
     json: Path | None = None
     """Write all figures here."""
     plot: Path | None = None
-    """Draw Table 3 here, like the paper's Fig. 15(a); needs the extra `plot`."""
+    """Draw the table here, like the paper's Fig. 15(a); needs the extra `plot`."""
     seeds: int = SEEDS
     """How many times every start is taken, with other markers hidden."""
     overwrite: bool = False
