@@ -489,7 +489,8 @@ SOURCES = {
         files=_files("*", lambda path: path.stem),
         splits=_in_order,
         read=_measured,
-        where=f"your own marker files ({', '.join(SUFFIXES)}), a file or a folder",
+        where=f"your own marker files ({', '.join(SUFFIXES)}), a file or a folder; "
+        "folders in it are not looked into",
     ),
 }
 """The data sets by name."""

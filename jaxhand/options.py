@@ -47,10 +47,15 @@ def read_layers(text: str) -> Spec:
     dropout; or from a JSON file with a list of layers as `numpy_infer.networks.read_spec` has it.
 
     Raises:
-        ValueError: neither; the message names the layer.
+        ValueError: neither; the message names the layer, or the file.
     """
     if text.endswith(".json"):
-        layers = json.loads(Path(text).read_text("utf-8"))
+        try:
+            layers = json.loads(Path(text).read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise ValueError(f"layers {text}: {error}") from None
+        if not isinstance(layers, list):
+            raise ValueError(f"layers {text}: expected a list, found {type(layers).__name__}")
     else:
         layers = [_read_layer(part) for part in text.split(",")]
     return read_spec([*layers, {"type": "dense", "units": 1, "activation": "linear"}])[:-1]

@@ -20,6 +20,7 @@ from jaxhand.evaluation import COUNTS, DURATIONS, SEEDS, Report, mean_ratio, met
 from jaxhand.joint_evaluation import joint_errors
 from jaxhand.options import AlsoModels, DataSets, Takes, Unit
 from jaxhand.pictures import check_picture, table_picture
+from jaxhand.predictors import PREDICTORS
 from jaxhand.sequences import Dataset
 from numpy_infer.cli import check_output
 from numpy_infer.model import Model, bundled
@@ -35,7 +36,7 @@ class EvaluationConfig:
     """Data set NAME[:PATH]; its test split is taken. One a table."""
     model: str | None = None
     """A model file of `jaxhand train`, a bundled model's name (default: the one for the data set's
-    hand), or the name of a baseline for the baselines alone."""
+    hand), or the name of a baseline, or of a predictor of your own, for those alone."""
     table: Literal[3, 4] = 3
     """3: hidden markers, and the joints with nothing hidden; 4: the joints while markers are
     hidden, beside inverse kinematics."""
@@ -53,7 +54,7 @@ class EvaluationConfig:
     json: Path | None = None
     """Write all figures here."""
     plot: Path | None = None
-    """Draw Table 3 here, like the paper's Fig. 15(a); needs the extra `plot`."""
+    """Draw the table here, like the paper's Fig. 15(a); needs the extra `plot`."""
     seeds: int = SEEDS
     """How many times every start is taken, with other markers hidden."""
     overwrite: bool = False
@@ -82,7 +83,8 @@ def evaluate(config: EvaluationConfig, console: Console | None = None) -> dict[s
         check_picture(config.plot, overwrite=config.overwrite)
     if len(config.data) != 1:
         raise ValueError(f"expected one --data, found {len(config.data)}: each gets its own table")
-    named = config.model is not None and config.model not in BASELINES
+    untrained = PREDICTORS.keys() - {"learned", "none"}
+    named = config.model is not None and config.model not in untrained
     model = load_model(str(config.model)) if named else None
     if config.table == 4 and config.model is not None:
         _check_joints("Table 4", model)

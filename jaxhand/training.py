@@ -84,12 +84,13 @@ class TrainingConfig:
     """The coordinates of `recordings` are left-handed."""
     marker_layers: Layers = (Dense(200), Dense(150), Dense(200))
     """Hidden layers of the marker network: units with ReLU, dropouts as parts of 1 (200,0.1,200),
-    or a JSON file; a linear layer follows."""
+    or a JSON file with a list of {"type": "dense", "units": 200, "activation": "relu"} (or
+    "linear") and {"type": "dropout", "rate": 0.1}; a linear layer follows."""
     joint_layers: Layers = (Dense(200), Dense(200), Dense(200))
     """Hidden layers of the joint network, likewise."""
     joints: bool = True
-    """Train the joint network, too: on the data's joint truth or, where there is none, on
-    simulated postures in the same glove."""
+    """The joint network is trained, too, unless this is said: on the data's joint truth or, where
+    there is none, on simulated postures in the same glove."""
     position_weight: float = 30.0
     """Weight of the joints' positions, through forward kinematics, in the joint network's loss
     beside the mean square of its angles."""
@@ -142,8 +143,16 @@ class TrainingConfig:
             raise ValueError(f"sizes: expected 0 to 0.5, a part of 1, found {self.sizes}")
         if not (self.mixed >= 0 and self.drawn >= 0 and self.mixed + self.drawn <= 1):
             raise ValueError(
-                f"mixed and drawn: expected parts of 1, found {self.mixed} and {self.drawn}"
+                "mixed and drawn: expected parts of the same frames, 1 together at most, found "
+                f"{self.mixed} and {self.drawn}"
             )
+        own = [n for n in PAPER_JOINTS if getattr(self, n) != getattr(TrainingConfig, n)]
+        if self.paper_joints and own:
+            raise ValueError(
+                f"paper_joints has its own {', '.join(own)}: leave out the one or these"
+            )
+        if self.paper_joints and not self.joints:
+            raise ValueError("paper_joints is how joints are trained: leave out one or the other")
         if self.resume and self.overwrite:
             raise ValueError("resume and overwrite exclude each other")
         names = [parse_spec(text).name for text in self.data]
@@ -152,6 +161,11 @@ class TrainingConfig:
             raise ValueError(f"train and validation name takes of one data set, {found}")
         if (self.unit is not None or self.left_handed) and OWN not in names:
             raise ValueError(f"unit and left_handed are for {OWN}, {found}")
+        if self.truth is not None and "sig18" not in names:
+            raise ValueError(f"truth is fitted to sig18 alone, {found}")
+        for spec in map(parse_spec, self.data):
+            if spec.name == SIMULATED and spec.path is not None:
+                raise ValueError(f"{SIMULATED} has no files: leave out {spec.path}")
 
 
 class Metrics(NamedTuple):
@@ -304,23 +318,10 @@ def fit_networks(
         KeyboardInterrupt: before the end of the first epoch, when there is nothing to keep.
     """
     if config.paper_joints:
-        config = replace(config, **PAPER_JOINTS)
+        config = replace(config, paper_joints=False, **PAPER_JOINTS)
     if not config.joints:
         training, validation = (x._replace(angles=None) for x in (training, validation))
-    check_frames("training", training, hand, config.batch)
-    check_frames("validation", validation, hand, 1)
-    if not training.simulated and (start is None or start.marker_network is None):
-        check_measured("training", training, hand)
-    if joint_frames is None and training.angles is not None and validation.angles is not None:
-        joint_frames = training, validation
-    if joint_frames is not None:
-        check_joint_frames("training", joint_frames[0], hand, config.batch)
-        check_joint_frames("validation", joint_frames[1], hand, 1)
-    occlusions: tuple[float, ...] | Occlusions
-    if isinstance(config.occlusions, str):
-        occlusions = of_layout(config.occlusions, hand.markers)
-    else:
-        occlusions = config.occlusions
+    occlusions, joint_frames = _checked(training, validation, hand, config, joint_frames, start)
     tasks = [
         partial(
             marker_task,
@@ -376,6 +377,34 @@ def fit_networks(
         posture = prior_of(angles[np.isfinite(angles).all(-1)])._asdict()
         summary["posture"] = {name: array.tolist() for name, array in posture.items()}
     return Model(hand, predictor="learned", joints=joints, training=summary, **networks)
+
+
+def _checked(
+    training: Frames,
+    validation: Frames,
+    hand: Hand,
+    config: TrainingConfig,
+    joint_frames: tuple[Frames, Frames] | None,
+    start: Model | None,
+) -> tuple[tuple[float, ...] | Occlusions, tuple[Frames, Frames] | None]:
+    """How markers are hidden, and what the joint network is trained and validated on, if it is.
+
+    Raises:
+        ValueError: what `fit_networks` refuses before it trains.
+    """
+    check_frames("training", training, hand, config.batch)
+    check_frames("validation", validation, hand, 1)
+    if not training.simulated and (start is None or start.marker_network is None):
+        check_measured("training", training, hand)
+    known = config.joints and training.angles is not None and validation.angles is not None
+    if joint_frames is None and known:
+        joint_frames = training, validation
+    if joint_frames is not None:
+        check_joint_frames("training", joint_frames[0], hand, config.batch)
+        check_joint_frames("validation", joint_frames[1], hand, 1)
+    if isinstance(config.occlusions, str):
+        return of_layout(config.occlusions, hand.markers), joint_frames
+    return config.occlusions, joint_frames
 
 
 def _fit(
@@ -448,6 +477,9 @@ def train(config: TrainingConfig) -> Model:
     given = collect(config)
     plain[runs.DIGEST] = given.digest
     runs.check(config.out, plain)
+    # What is refused leaves no folder behind, and throws no older run away.
+    frames = given.training, given.validation
+    _checked(*frames, given.hand, config, given.joint_frames, given.start)
     runs.create(config.out, plain)
 
     def report(m: Metrics) -> None:

@@ -57,6 +57,7 @@ def collect(config: TrainingConfig) -> Given:
         ValueError: data that are missing or do not fit together, or a model that does not.
     """
     start = None if config.start is None else load_model(config.start)
+    _check_layers(config, start)
     recorded, held_out = (_load(config, split, start) for split in ("train", "validation"))
     specs = [parse_spec(text) for text in config.data]
     of_files = [spec for spec in specs if spec.name != SIMULATED]
@@ -98,6 +99,22 @@ def _digest(config: TrainingConfig, hand: Hand, datasets: list[Dataset]) -> str:
     return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:16]
 
 
+def _check_layers(config: TrainingConfig, start: Model | None) -> None:
+    """Refuses layers that were asked for where those of the model are gone on with.
+
+    Raises:
+        ValueError: names the option to leave out.
+    """
+    for network in ("marker", "joint"):
+        begun = getattr(start, f"{network}_network", None)
+        layers = f"{network}_layers"
+        asked = getattr(config, layers)
+        if begun and asked not in (getattr(type(config), layers), begun.spec[:-1]):
+            raise ValueError(
+                f"{layers}: {config.start} has its own and is gone on with: leave them out"
+            )
+
+
 def _takes(dataset: Dataset) -> str:
     names = sorted({sequence.take for sequence in dataset.sequences})
     seconds = sum(len(sequence.markers) / sequence.rate for sequence in dataset.sequences)
@@ -112,6 +129,9 @@ def _split(spec: DatasetSpec, training: Dataset, validation: Dataset) -> str:
     """Which takes are for what: `jaxhand evaluate` goes by the default split if told no other."""
     said = f"{training.name}: {_takes(training)} to train, {_takes(validation)} to validate"
     used = {s.take.split("/")[0] for dataset in (training, validation) for s in dataset.sequences}
+    train, hold = ({s.take for s in dataset.sequences} for dataset in (training, validation))
+    if both := sorted(train & hold):
+        said += f" ({_named(both)} in both: the validation says nothing of other takes)"
     tested = default_takes(spec, "test")
     if not tested:
         return said

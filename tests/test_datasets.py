@@ -173,6 +173,12 @@ def test_both_hands_of_a_take_fall_into_one_split(tmp_path: Path) -> None:
     }
 
 
+def test_a_folder_of_folders_holds_no_takes_and_that_is_said(tmp_path: Path) -> None:
+    write_takes(tmp_path / "session", ["a"])
+    with pytest.raises(ValueError, match=r"holds no takes: .* folders in it are not looked into"):
+        load(f"recordings:{tmp_path}", "test")
+
+
 def test_labels_beside_the_recordings_are_used(tmp_path: Path) -> None:
     write_takes(tmp_path, ["a"], names=[f"m{i}" for i in range(9)])
     labels = {f"m{i}": name for i, name in enumerate(HAND.markers)}

@@ -15,6 +15,7 @@ from rich.console import Console
 
 from jaxhand import evaluation, expected_error, report
 from jaxhand.cli import evaluate
+from jaxhand.predictors import PREDICTORS
 from jaxhand.sequences import Sequence
 from jaxhand.training import TrainingConfig
 from jaxhand.training_data import collect
@@ -200,6 +201,20 @@ def test_a_command_writes_its_table_and_its_picture(
     assert set(written) == {"table3", "joints"}
     assert f"{written['table3']['affine']['1']['0.1']['mean']:.2f}" in printed
     assert (tmp_path / "t3.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_predictor_of_ones_own_is_named_like_a_baseline(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    time = np.arange(70) / 60
+    write(Recording(HAND.markers, wriggling(70, 0).markers, time, 60.0, ""), tmp_path / "one.csv")
+    monkeypatch.setitem(PREDICTORS, "mine", PREDICTORS["affine"])
+    monkeypatch.setattr(report, "_markers_report", lambda model, *_: {"of": model.predictor})
+    data = (f"recordings:{tmp_path}",)
+    config = report.EvaluationConfig(data=data, model="mine", test=("one",))
+    assert report.evaluate(config, Console(quiet=True)) == {"of": "mine"}
+    with pytest.raises(ValueError, match="no model file learned"):
+        report.evaluate(replace(config, model="learned"), Console(quiet=True))
 
 
 def test_what_files_do_not_say_can_be_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

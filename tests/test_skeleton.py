@@ -256,3 +256,21 @@ def test_calibrated_by_a_flat_hand_that_hand_is_flat(
     calibrated = side.skeleton.flat_calibrated(held, held)
     assert_allclose(calibrated, np.broadcast_to(EYE, (15, 3, 3)), atol=side.metres)
     assert_allclose(held @ side.skeleton.flat_calibrated(rotations, held), rotations, atol=1e-5)
+
+
+def test_where_angles_put_the_points_has_a_gradient_flat_hand_included() -> None:
+    jax = pytest.importorskip("jax")
+    from jaxhand import skeleton
+
+    dtype = np.float32
+    bones, still = HAND.skeleton.astype(dtype), (EYE.astype(dtype), np.zeros(3, dtype))
+
+    def reach(angles: Array) -> Array:
+        rotations = skeleton.rotations_from_angles(angles)
+        return (skeleton.forward_kinematics(bones, rotations, *still)[0] ** 2).sum()
+
+    for angles in (np.zeros(26, dtype), (0.3 * HIGH).astype(dtype)):
+        slope = np.asarray(jax.grad(reach)(angles))
+        step = 1e-2 * np.eye(26, dtype=dtype)
+        measured = [float(reach(angles + s) - reach(angles - s)) / 2e-2 for s in step]
+        assert_allclose(slope, measured, atol=1e-4)

@@ -237,7 +237,8 @@ def test_the_joint_loss_is_angles_and_weighed_positions() -> None:
 
 
 def test_the_papers_recipe_is_a_preset() -> None:
-    model, _ = fit(replace(CONFIG, paper_joints=True, epochs=1))
+    own = {"joint_layers": TrainingConfig.joint_layers}
+    model, _ = fit(replace(CONFIG, paper_joints=True, epochs=1, **own))
     spec = model.joint_network.spec
     assert spec == (*training.PAPER_JOINTS["joint_layers"], Dense(26, "linear"))
 
@@ -387,6 +388,14 @@ def test_what_is_interrupted_while_it_is_finished_replaces_nothing(
         ({"occlusions": (0.5, 0.4)}, "occlusions"),
         ({"resume": True, "overwrite": True}, "exclude"),
         ({"data": ("a", "b"), "train": ("x",)}, "one data set"),
+        ({"drawn": 0.5}, "mixed and drawn: .* 1 together at most, found 1.0 and 0.5"),
+        ({"paper_joints": True}, "paper_joints has its own joint_layers"),
+        (
+            {"paper_joints": True, "joint_layers": TrainingConfig.joint_layers, "joints": False},
+            "paper_joints is how joints are trained",
+        ),
+        ({"data": ("simulated",), "truth": Path("t")}, "truth is fitted to sig18 alone, found sim"),
+        ({"data": ("simulated:takes@2",)}, "simulated has no files: leave out takes"),
     ],
 )
 def test_senseless_configs_are_refused(wrong: dict[str, Any], message: str) -> None:
@@ -404,12 +413,34 @@ def test_senseless_frames_are_refused() -> None:
         fit_networks(Frames(holes), VALIDATION, HAND, CONFIG)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "message"), [({"batch": 400}, "400 or more frames"), ({"occlusions": "x"}, "no file")]
+)
+def test_what_is_refused_leaves_the_folder_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: dict[str, Any], message: str
+) -> None:
+    given = make_dataset("a", TRAINING, 1.0, 1.1)
+    monkeypatch.setattr(training_data, "load", lambda spec, split, **_: given)
+    config = replace(CONFIG, data=("a",), out=tmp_path / "run", **wrong)
+    with pytest.raises(ValueError, match=message):
+        training.train(config)
+    assert not config.out.exists()
+    config.out.mkdir()
+    (config.out / "model.npz").write_text("an older run's")
+    with pytest.raises(ValueError, match=message):
+        training.train(replace(config, overwrite=True))
+    assert [path.name for path in config.out.iterdir()] == ["model.npz"]
+
+
 def test_layers_are_read_from_text_and_file(tmp_path: Path) -> None:
     assert options.read_layers("200,0.1,150") == (Dense(200), Dropout(0.1), Dense(150))
     file = tmp_path / "layers.json"
     file.write_text('[{"type": "dense", "units": 8, "activation": "linear"}]')
     assert options.read_layers(str(file)) == (Dense(8, "linear"),)
-    for wrong in ("200,x", "0", "1.5", "", "-3"):
+    file.write_text("[{")
+    (tmp_path / "object.json").write_text("{}")
+    files = [str(tmp_path / name) for name in ("layers.json", "none.json", "object.json")]
+    for wrong in ("200,x", "0", "1.5", "", "-3", *files):
         with pytest.raises(ValueError, match="layer"):
             options.read_layers(wrong)
 

@@ -28,6 +28,7 @@ from jaxhand.tasks import Frames
 from jaxhand.training import fit_networks
 from numpy_infer import model as model_file
 from numpy_infer.hand import load_hand
+from numpy_infer.networks import Dense
 
 
 def test_data_sets_are_joined_frame_by_frame() -> None:
@@ -103,7 +104,8 @@ def test_unit_and_side_are_said_of_recordings_and_takes_of_what_is_not_simulated
 
     def load(spec: str, split: str, **options: Any) -> Any:
         told.setdefault(spec, []).append(options)
-        return make_dataset("a", TRAINING, 1.0, 1.0)
+        named = {"train": "a", "validation": "b"}[split]
+        return make_dataset(named, TRAINING, 1.0, 1.0)
 
     monkeypatch.setattr(training_data, "load", load)
     unnamed = {"hand": None, "takes": None, "truth": False}
@@ -138,8 +140,12 @@ def test_what_is_left_to_test_on_is_said(
         replace(sequence, take=take)
         for sequence, take in zip(dataset.sequences, used, strict=False)
     ]
-    dataset = replace(dataset, sequences=tuple(sequences))
-    monkeypatch.setattr(training_data, "load", lambda *_, **__: dataset)
+    parts = {"train": sequences[:-1], "validation": sequences[-1:]}
+
+    def load(_: str, split: str, **__: Any) -> Any:
+        return replace(dataset, sequences=tuple(parts[split]))
+
+    monkeypatch.setattr(training_data, "load", load)
     given = training_data.collect(replace(CONFIG, data=(f"recordings:{tmp_path}",)))
     assert given.notes[0].endswith(f" to validate{said}")
 
@@ -170,6 +176,38 @@ def test_other_files_under_the_same_paths_are_noticed(
     sequences = (replace(first, markers=blind), *held["dataset"].sequences[1:])
     held["dataset"] = replace(held["dataset"], sequences=sequences)
     assert len({before, other_gaps, other_start, digest()}) == 4
+
+
+@pytest.mark.usefixtures("made")
+def test_takes_to_train_and_to_validate_on_are_pointed_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sequences = make_dataset("a", TRAINING, 1.0, 1.0).sequences
+    parts = {"train": sequences[:3], "validation": sequences[2:4]}
+
+    def load(_: str, split: str, **__: Any) -> Any:
+        return replace(make_dataset("a", TRAINING, 1.0, 1.0), sequences=parts[split])
+
+    monkeypatch.setattr(training_data, "load", load)
+    given = training_data.collect(replace(CONFIG, data=("recordings:takes",)))
+    assert "(a40 in both: the validation says nothing of other takes)" in given.notes[0]
+
+
+@pytest.mark.usefixtures("made")
+def test_layers_beside_a_model_that_has_its_own_are_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(
+        training_data, "load", lambda *_, **__: make_dataset("a", TRAINING, 1.0, 1.0)
+    )
+    start = tmp_path / "model.npz"
+    short = replace(CONFIG, data=("recordings:takes",), epochs=1, joints=False)
+    model_file.save(fit_networks(TRAINING, VALIDATION, HAND, short), start)
+    own, other = CONFIG.marker_layers, (Dense(25),)
+    for layers in (own, training.TrainingConfig.marker_layers):
+        training_data.collect(replace(short, start=start, marker_layers=layers))
+    with pytest.raises(ValueError, match=r"marker_layers: .*model\.npz has its own"):
+        training_data.collect(replace(short, start=start, marker_layers=other))
 
 
 @pytest.mark.parametrize(
