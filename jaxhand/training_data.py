@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Collection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -16,13 +16,11 @@ from jaxhand.datasets import OWN, SIMULATED, DatasetSpec, Split, default_takes, 
 from jaxhand.occlusions import FEWEST_LEFT
 from jaxhand.sequences import Dataset, Sequence
 from jaxhand.tasks import Frames, complete
+from jaxhand.training_config import TrainingConfig
 from numpy_infer.arrays import Array
 from numpy_infer.hand import ANGLES, Hand, load_hand
 from numpy_infer.model import Model
 from numpy_infer.model import load as load_model
-
-if TYPE_CHECKING:
-    from jaxhand.training import TrainingConfig
 
 POSTURES, PEOPLE, SECONDS = 20_000, 16, 10
 """Simulated frames of an epoch, a tenth of it to validate on; people who move to choose on what
