@@ -2,7 +2,8 @@
 
 Table 3 on a data set's test takes for the affine combination, the bundled model that has seen
 simulated hands only, a model of the data's own training takes, and the bundled one refined on
-those. Trains twice, some three minutes each on two cores.
+those; of either also one that was shown these hands in other sizes. Trains four times, some three
+minutes each on two cores.
 """
 
 from __future__ import annotations
@@ -26,21 +27,30 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/no_data"), help="of the run folders")
     parser.add_argument("--epochs", type=int, default=300, help="at most")
     parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--sizes", type=float, default=0.06, help="spread of the other sizes")
+    parser.add_argument("--seed", type=int, default=0, help="of the trainings")
     options = parser.parse_args()
     for data in options.data:
         name = datasets.parse_spec(data).name
         test = datasets.load(data, "test")
         bundled = Path(str(models.WEIGHTS / f"{test.hand.name}.npz"))
         own = TrainingConfig(
-            (data,), options.out / name, joints=False, epochs=options.epochs, overwrite=True
+            (data,),
+            options.out / name,
+            joints=False,
+            epochs=options.epochs,
+            seed=options.seed,
+            overwrite=True,
         )
-        refined = replace(own, out=options.out / f"{name}_refined", start=bundled)
         rows = {
             "affine": Model(test.hand, predictor="affine"),
             "simulated": replace(models.load(bundled), joints="none"),
-            "recorded": train(own),
-            "simulated, refined": replace(train(refined), joints="none"),
         }
+        for sizes, also in ((0.0, ""), (options.sizes, ", other sizes")):
+            for start, row in ((None, "recorded"), (bundled, "simulated, refined")):
+                out = options.out / f"{name}_{row}{also}".replace(", ", "_").replace(" ", "_")
+                model = train(replace(own, out=out, start=start, sizes=sizes))
+                rows[row + also] = replace(model, joints="none")
         table = evaluation.table3(rows, test.sequences, seeds=options.seeds)
         print(f"\n{data}, cm; hidden markers and seconds:", *(f"{c}/{d}" for c, d in CELLS))
         for row, cells in table.items():
@@ -49,7 +59,7 @@ def main() -> None:
             ratios = (evaluation.mean_ratio(table, row, rival) for rival in ("affine", "recorded"))
             of_affine, of_recorded = ratios
             print(
-                f"  {row:18}",
+                f"  {row:31}",
                 *figures,
                 f" {of_affine:.3f} of affine, {of_recorded:.3f} of recorded",
             )
