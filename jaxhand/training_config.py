@@ -122,6 +122,8 @@ class TrainingConfig:
             raise ValueError(f"train and validation name takes of one data set, {found}")
         if (self.unit is not None or self.left_handed) and OWN not in names:
             raise ValueError(f"unit and left_handed are for {OWN}, {found}")
+        if self.sizes and set(names) == {SIMULATED}:
+            raise ValueError(f"sizes are for recordings: {SIMULATED} hands have people's already")
         if self.truth is not None and "sig18" not in names:
             raise ValueError(f"truth is fitted to sig18 alone, {found}")
         for spec in map(parse_spec, self.data):

@@ -74,3 +74,6 @@ def test_a_training_is_told_of_it() -> None:
     for wrong in (-0.1, 0.5, float("nan")):
         with pytest.raises(ValueError, match="sizes: expected 0 to"):
             replace(CONFIG, sizes=wrong)
+    with pytest.raises(ValueError, match="sizes are for recordings"):
+        replace(CONFIG, data=("simulated",), sizes=0.06)
+    replace(CONFIG, data=("simulated", "recordings:takes"), sizes=0.06)
