@@ -22,6 +22,7 @@ import optax
 from rich.console import Console
 
 from jaxhand import runs
+from jaxhand.anthropometry import SIZE_SPREAD
 from jaxhand.export import export, finish
 from jaxhand.networks import from_arrays
 from jaxhand.occlusions import Occlusions, of_layout
@@ -213,7 +214,7 @@ def fit_networks(
             hidden=config.marker_layers,
             occlusions=occlusions,
             start=start.marker_network if start else None,
-            sizes=config.sizes,
+            sizes=_sizes(config, start),
         )
     ]
     if joint_frames is not None:
@@ -259,6 +260,12 @@ def fit_networks(
         posture = prior_of(angles[np.isfinite(angles).all(-1)])._asdict()
         summary["posture"] = {name: array.tolist() for name, array in posture.items()}
     return Model(hand, predictor="learned", joints=joints, training=summary, **networks)
+
+
+def _sizes(config: TrainingConfig, start: Model | None) -> float:
+    if config.sizes is not None:
+        return config.sizes
+    return 0.0 if start is None or start.marker_network is None else SIZE_SPREAD
 
 
 def _checked(

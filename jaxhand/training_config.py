@@ -65,9 +65,10 @@ class TrainingConfig:
     occlusions: tuple[float, ...] | str = (0.70, 0.17, 0.08, 0.05)
     """Probabilities that 1, 2, 3, … markers are hidden, any of them alike; or a file of `jaxhand
     occlusions --json`: as many as there, and those that were missing more often more often."""
-    sizes: float = 0.0
-    """Spread of the sizes in which the marker network is shown recorded hands: 0.06 is people's,
-    for recordings of a few who are not those to be tracked."""
+    sizes: float | None = None
+    """Spread of the sizes in which the marker network is shown recorded hands, for recordings of a
+    few people; people's is 0.07. By default that for a model that is gone on from, which would
+    forget the sizes it knows, and otherwise 0, as in the paper."""
     batch: int = 32
     """Frames a step."""
     learning_rate: float = 1e-3
@@ -100,7 +101,7 @@ class TrainingConfig:
             raise ValueError(f"occlusions: expected parts that sum to 1, found {parts}")
         if not 0 <= self.position_weight < math.inf:
             raise ValueError(f"position_weight: expected 0 or more, found {self.position_weight}")
-        if not 0 <= self.sizes < 0.5:
+        if self.sizes is not None and not 0 <= self.sizes < 0.5:
             raise ValueError(f"sizes: expected 0 to 0.5, a part of 1, found {self.sizes}")
         if not (self.mixed >= 0 and self.drawn >= 0 and self.mixed + self.drawn <= 1):
             raise ValueError(

@@ -14,9 +14,11 @@ import jax
 from small_training import CONFIG, HAND, TRAINING, VALIDATION, with_gaps
 
 from jaxhand import tasks
+from jaxhand.anthropometry import SIZE_SPREAD
 from jaxhand.tasks import Frames
 from jaxhand.training import fit_networks
 from numpy_infer.arrays import Array
+from numpy_infer.model import Model
 
 
 def shown(frames: Frames, sizes: float, key: int = 1) -> Array:
@@ -63,14 +65,22 @@ def test_simulated_hands_have_people_s_sizes_already() -> None:
     np.testing.assert_array_equal(shown(frames, 0.06), shown(frames, 0.0))
 
 
-def test_a_training_is_told_of_it() -> None:
+def test_a_training_is_told_of_it_and_a_refinement_does_it_by_itself() -> None:
     short = replace(CONFIG, epochs=1, joints=False)
-    networks = [
-        fit_networks(TRAINING, VALIDATION, HAND, replace(short, sizes=sizes)).marker_network
-        for sizes in (0.0, 0.06)
-    ]
-    one, other = (np.asarray(network.arrays["0.kernel"]) for network in networks)
-    assert np.abs(one - other).max() > 1e-4
+    first = fit_networks(TRAINING, VALIDATION, HAND, short)
+
+    def kernel(sizes: float | None, start: Model | None) -> Array:
+        config = replace(short, sizes=sizes)
+        network = fit_networks(TRAINING, VALIDATION, HAND, config, start=start).marker_network
+        return np.asarray(network.arrays["0.kernel"])
+
+    for start, by_default in ((None, 0.0), (first, SIZE_SPREAD)):
+        ways = {sizes: kernel(sizes, start) for sizes in (0.0, SIZE_SPREAD, None)}
+        np.testing.assert_array_equal(ways[None], ways[by_default])
+        assert np.abs(ways[0.0] - ways[SIZE_SPREAD]).max() > 1e-4
+
+
+def test_senseless_sizes_are_refused() -> None:
     for wrong in (-0.1, 0.5, float("nan")):
         with pytest.raises(ValueError, match="sizes: expected 0 to"):
             replace(CONFIG, sizes=wrong)
