@@ -171,8 +171,9 @@ def _frame(model: Model, state: State, markers: Array, visible: Array, dt: Array
     correction = jnp.where(sure | known, untransform(*then, last) - again, 0)
 
     length = jnp.sqrt((correction * correction).sum(-1, keepdims=True))
-    far_apart = ((jnp.abs(measured) > HUGE).any(-1) & visible).any((0, -1))[..., None, None]
-    correction = jnp.where((length < FARTHEST_CORRECTION) & ~far_apart, correction, 0)
+    no_hand = too_far_apart(measured[0], visible) | too_far_apart(state.seen, state.visible)
+    near = (length < FARTHEST_CORRECTION) & ~no_hand[..., None, None]
+    correction = jnp.where(near, correction, 0)
     seen = untransform(*now, transform(turn, move, before))
     drift = jnp.where(state.visible, 0, state.drift + state.change[..., None])
     # Hands whose set is the same go on as they were; those seen for the first time begin.
@@ -198,6 +199,11 @@ def _frame(model: Model, state: State, markers: Array, visible: Array, dt: Array
         registered,
         raw,
     )
+
+
+def too_far_apart(registered: Array, visible: Array) -> Array:
+    """`[...]` True where visible markers `[..., M, 3]` of the registered frame are no hand's."""
+    return ((jnp.abs(registered) > HUGE).any(-1) & visible).any(-1)
 
 
 def _carried_prior(state: State, markers: Array, weight: Array) -> Array:

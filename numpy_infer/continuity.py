@@ -254,9 +254,9 @@ def _unsteady(
         correction = np.where(determined | known, correction, 0)
 
     near = squares(correction) < FARTHEST_CORRECTION**2
-    far_apart = np.abs(measured) > HUGE
-    if np.count_nonzero(far_apart):
-        near = near & ~(far_apart.any(-1) & visible).any((0, -1))[..., None]
+    no_hand = too_far_apart(measured[0], visible) | too_far_apart(state.seen, state.visible)
+    if some(no_hand):
+        near = near & ~no_hand[..., None]
     if np.count_nonzero(near) < near.size:
         correction = np.where(near[..., None], correction, 0)
     anchor, prior = measured[1], then[0].swapaxes(-1, -2) @ followed
@@ -292,6 +292,12 @@ def _unsteady(
         exact,
         wrist if _measured(model, correction) else None,
     )
+
+
+def too_far_apart(registered: Array, visible: Array) -> Array:
+    """`[...]` True where visible markers `[..., M, 3]` of the registered frame are no hand's."""
+    far = np.abs(registered) > HUGE
+    return np.logical_or.reduce(np.logical_or.reduce(far, -1) & visible, -1)
 
 
 def _registration(

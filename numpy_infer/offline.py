@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from numpy_infer.arrays import Array
+from numpy_infer.arrays import Array, some
 from numpy_infer.continuity import (
     FARTHEST_CORRECTION,
     Frame,
@@ -23,10 +23,10 @@ from numpy_infer.continuity import (
     each,
     filled,
     posture_change,
+    too_far_apart,
 )
 from numpy_infer.geometry import PRIOR_STRENGTH, fit, kabsch, pattern, transform, untransform
 from numpy_infer.model import Model
-from numpy_infer.output import HUGE
 from numpy_infer.pose import State
 from numpy_infer.sight import parts_of
 
@@ -46,7 +46,8 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         return None
     rotation, translation = registration
     registered = untransform(rotation, translation, markers)
-    if _too_far_apart(registered, visible):
+    # What is no hand leaves no correction behind, see `continuity.FARTHEST_CORRECTION`.
+    if some(too_far_apart(registered, visible)) or some(too_far_apart(state.seen, state.visible)):
         return None
     registered = filled(model, registered, visible)
     state = each(lambda leaf: leaf[None], state)
@@ -72,7 +73,7 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
     changes = None
     if len(at):
         changes = _changes(model, state, frames, markers, visible, at)
-        if changes is None or _too_far_apart(changes.anchor, visible[at]):
+        if changes is None:
             return None
         frames = frames._replace(**_since(frames, changes, changed, at))
         for begin, end in pairwise([*at, len(dt)]):
@@ -85,11 +86,6 @@ def together(model: Model, state: State, markers: Array, visible: Array, dt: Arr
         )
     state = state._replace(known=state.known | np.logical_or.accumulate(visible, 0))
     return blended(model, state, frames, markers, visible, weight, elapsed)
-
-
-def _too_far_apart(registered: Array, visible: Array) -> bool:
-    """True if the visible markers of a frame are no hand's: that leaves no correction behind."""
-    return bool((visible & (np.abs(registered) > HUGE).any(-1)).any())
 
 
 class _Changes(NamedTuple):
