@@ -15,7 +15,7 @@ OWN = ("config.json", "metrics.jsonl", "checkpoints", "model.npz")
 """What a run's folder holds."""
 
 DIGEST = "digest"
-"""Beside the config: of what its paths held."""
+"""Beside the config: of what its paths held, see `training_data`."""
 
 FREE = ("out", "epochs", "resume", "overwrite")
 """What may differ when a run is gone on with: it leaves the numbers of every epoch alone."""

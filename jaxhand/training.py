@@ -364,6 +364,7 @@ def train(config: TrainingConfig) -> Model:
     plain = as_json(config)
     runs.check(config.out, plain)
     given = collect(config)
+    # Once more, now that it is known what lies under the paths.
     plain[runs.DIGEST] = given.digest
     runs.check(config.out, plain)
     # What is refused leaves no folder behind, and throws no older run away.

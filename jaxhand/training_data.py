@@ -78,20 +78,20 @@ def collect(config: TrainingConfig) -> Given:
     else:
         key = jax.random.key(config.seed)
         sequences = simulation.sequences(key, hand, PEOPLE, SECONDS)
-    digest = _digest(config, hand, recorded + held_out)
+    digest = _digest(config, recorded + held_out)
     return Given(hand, training, validation, joint_frames, sequences, start, tuple(notes), digest)
 
 
-def _digest(config: TrainingConfig, hand: Hand, datasets: list[Dataset]) -> str:
-    """The hand's markers, the takes with their lengths and gaps, and the bytes of files that are
-    not recordings: what another release of a library reads alike."""
-    said: list[Any] = [hand.markers, np.round(hand.offsets, 6).tolist()]
+def _digest(config: TrainingConfig, datasets: list[Dataset]) -> str:
+    """The takes with their lengths and gaps, and the bytes of files that are not recordings: what
+    another release of a library reads alike."""
+    said: list[Any] = []
     for dataset in datasets:
         said.append([dataset.name, dataset.weight])
         said += [
             [s.name, len(s.markers), int(np.isfinite(s.markers).sum())] for s in dataset.sequences
         ]
-    for path in (config.start, config.occlusions):
+    for path in (config.hand, config.start, config.occlusions):
         if isinstance(path, str | Path) and Path(path).is_file():
             said.append(hashlib.sha256(Path(path).read_bytes()).hexdigest())
     return hashlib.sha256(json.dumps(said).encode()).hexdigest()[:16]

@@ -41,8 +41,8 @@ SHRINK_SPEED = 0.25
 
 FARTHEST_CORRECTION = 10.0
 """Metres: an output that is farther off comes of a frame that was no hand's (in millimetres, say),
-and is given up at once rather than for a minute. So is, whatever it is, what is missing to the
-output of a frame whose markers are too far apart (`HUGE`), and to that in such a frame."""
+and is given up at once rather than for a minute. Near or far, so is what a frame whose markers are
+too far apart (`HUGE`) is missing, and what is missing to its output in the frame behind it."""
 
 DRIFT_UNSEEN = 0.04
 """m/s: how fast the posture is taken to change while nothing determines the hand. In gaps like

@@ -44,9 +44,9 @@ class Notice(IntFlag):
     NON_POSITIVE_DT = 1
     """No time has passed, by `dt`: nothing that runs on time moves."""
     SUSPECTED_MILLIMETRES = 2
-    """Markers lie too far apart for metres. They are measurements all the same; once they are over,
-    nothing is left of them but where a baseline's hidden markers are, `HandTracker.reset` forgets
-    those, too."""
+    """Markers lie too far apart for metres. They are measurements all the same. Once they are over
+    and markers determine the hand again, a learned model fills without a trace of them; a baseline
+    goes on from what it made of them, until `HandTracker.reset`."""
     REJECTED_MARKERS = 4
     """The gate refused some; `Status.REJECTED` says which."""
 

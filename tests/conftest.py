@@ -86,6 +86,17 @@ def few_streams() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def put(tmp_path: Path) -> Callable[[str, str], Path]:
+    """Puts a text into a file, as it stands."""
+
+    def write_text(name: str, text: str) -> Path:
+        (tmp_path / name).write_bytes(text.encode())
+        return tmp_path / name
+
+    return write_text
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """With `pytest -n 2` a file is one worker's: what its tests share is made once."""

@@ -1,7 +1,6 @@
 """Each format as its programs write it: what is read, what is a gap, what is refused and where."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -113,15 +112,6 @@ EXAMPLES = {
 MARKERS = np.full((3, 2, 3), np.nan)
 MARKERS[0] = np.array([[1, 2, 3], [4, 5, 6]]) / 1000
 MARKERS[1, 1] = np.array([4, 5, 7]) / 1000
-
-
-@pytest.fixture
-def put(tmp_path: Path) -> Callable[[str, str], Path]:
-    def write_text(name: str, text: str) -> Path:
-        (tmp_path / name).write_bytes(text.encode())
-        return tmp_path / name
-
-    return write_text
 
 
 def turned(axis: str, degrees: float) -> np.ndarray:

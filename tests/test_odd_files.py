@@ -28,15 +28,6 @@ time,a.x,a.y,a.z,b.x,b.y,b.z
 """
 
 
-@pytest.fixture
-def put(tmp_path: Path) -> Callable[[str, str], Path]:
-    def write_text(name: str, text: str) -> Path:
-        (tmp_path / name).write_bytes(text.encode())
-        return tmp_path / name
-
-    return write_text
-
-
 def test_trc_with_a_blank_unit_takes_the_one_that_is_given(put: Callable) -> None:
     path = put("take.trc", TRC.replace("\tmm", "\t"))
     with pytest.raises(ValueError, match=r"take\.trc:3: the header has no Units: pass --unit mm"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -154,12 +155,14 @@ def test_what_is_left_to_test_on_is_said(
 def test_other_files_under_the_same_paths_are_noticed(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    start, gaps = tmp_path / "start.npz", tmp_path / "gaps.json"
+    start, gaps, glove = (tmp_path / name for name in ("start.npz", "gaps.json", "glove.json"))
     held = {"dataset": make_dataset("own", TRAINING, 1.0, 1.0)}
     monkeypatch.setattr(training_data, "load", lambda *_, **__: held["dataset"])
     model_file.save(model_file.Model(HAND, "affine"), start)
     gaps.write_text("one")
-    config = replace(CONFIG, data=("recordings:x",), start=start, occlusions=str(gaps))
+    glove.write_text(json.dumps(HAND.to_json()))
+    paths = {"hand": str(glove), "start": start, "occlusions": str(gaps)}
+    config = replace(CONFIG, data=("recordings:x",), **paths)
 
     def digest() -> str:
         return training_data.collect(config).digest
@@ -170,12 +173,14 @@ def test_other_files_under_the_same_paths_are_noticed(
     other_gaps = digest()
     model_file.save(model_file.Model(HAND, "last_known"), start, overwrite=True)
     other_start = digest()
+    glove.write_text(json.dumps(HAND.with_skeleton(1.1 * HAND.skeleton).to_json()))
+    other_bones = digest()
     first = held["dataset"].sequences[0]
     blind = first.markers.copy()
     blind[3, 2] = np.nan
     sequences = (replace(first, markers=blind), *held["dataset"].sequences[1:])
     held["dataset"] = replace(held["dataset"], sequences=sequences)
-    assert len({before, other_gaps, other_start, digest()}) == 4
+    assert len({before, other_gaps, other_start, other_bones, digest()}) == 5
 
 
 @pytest.mark.usefixtures("made")

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from streams import a_model, at_least, blocks, motion
+from streams import Stream, a_model, at_least, blocks, motion, run
 
 from numpy_infer import tracker
 from numpy_infer.model import Model
-from numpy_infer.pose import HandPose, Notice
+from numpy_infer.pose import Notice
 
 Array = np.ndarray
 
@@ -31,14 +31,6 @@ def a_stream(model: Model, seed: int, hands: int = 2) -> tuple[Array, Array, Arr
     return truth, markers, visible, np.full(visible.shape[:2], 1 / 60)
 
 
-def stepped(model: Model, *frames: Array) -> HandPose:
-    state, poses = tracker.init(model, frames[1].shape[1:2]), []
-    for frame in zip(*frames, strict=True):
-        state, pose = tracker.step(model, state, *frame)
-        poses.append(pose)
-    return HandPose(*(None if f[0] is None else np.array(f) for f in zip(*poses, strict=True)))
-
-
 @pytest.mark.parametrize("gate", [False, True])
 @settings(max_examples=20)
 @example(seed=812)  # one marker alone is seen before and after the last of them
@@ -47,7 +39,7 @@ def test_frames_in_millimetres_leave_nothing_behind(gate: bool, seed: int) -> No
     # The baselines go on from their last output, whatever that was.
     model = a_model("learned", gate=gate)
     truth, *frames = a_stream(model, seed)
-    pose = stepped(model, *frames)
+    pose, _ = run(model, Stream(*frames))
     off = np.linalg.norm(pose.markers - truth, axis=-1)
     assert (pose.notice[WRONG] & Notice.SUSPECTED_MILLIMETRES).any()
     assert off[WRONG.stop :].max() < off[: WRONG.start].max() + GIVEN_UP
@@ -64,11 +56,11 @@ def test_in_jax_too() -> None:
     model = a_model("learned", dtype=np.float32)
 
     @jax.jit
-    def run(*frames: Array) -> Any:
+    def filled(*frames: Array) -> Any:
         return jaxhand.tracker.run(model, jaxhand.tracker.init(model, (2,)), *frames)[1].markers
 
     for seed in (*range(5), 812):
         truth, markers, visible, dt = a_stream(model, seed)
-        found = run(markers.astype(np.float32), visible, dt.astype(np.float32))
+        found = filled(markers.astype(np.float32), visible, dt.astype(np.float32))
         off = np.linalg.norm(np.asarray(found) - truth, axis=-1)
         assert off[WRONG.stop :].max() < off[: WRONG.start].max() + GIVEN_UP
