@@ -45,6 +45,8 @@ RESAMPLINGS, FEWEST_BLOCKS = 1000, 10
 
 CHUNK = 4096
 """The most trials run at once. All chunks have one size, to compile once."""
+ALIKE = 64
+"""Chunks are filled up to a multiple of it: so small data sets share what was compiled."""
 
 Cell = dict[str, Any]
 Report = Callable[[str, float], None]
@@ -199,14 +201,14 @@ def table_of(
     total = np.zeros((len(counts), len(durations), blocks))
     number = np.zeros(total.shape, int)
     chunks, size = chunked(len(starts.start))
-    for done, first in enumerate(chunks):
+    for done, chunk in enumerate(chunks):
         report(done / len(chunks))
-        part = Starts(starts.frames, *(array[first : first + size] for array in starts[1:]))
+        part = Starts(starts.frames, *(array[chunk] for array in starts[1:]))
         state = _visible_until(model, part, size)
         for i, count in enumerate(counts):
             for j, duration in enumerate(durations):
                 for seed in range(seeds):
-                    rng = np.random.default_rng([seed, count, j, first])
+                    rng = np.random.default_rng([seed, count, j, chunk.start])
                     error, block = errors(state, part, count, duration, rng)
                     total[i, j] += np.bincount(block, error, blocks)
                     number[i, j] += np.bincount(block, minlength=blocks)
@@ -220,10 +222,11 @@ def table_of(
     }
 
 
-def chunked(count: int) -> tuple[range, int]:
-    """Where the chunks of `count` trials begin, and their size."""
-    size = -(-count // -(-count // CHUNK))
-    return range(0, count, size), size
+def chunked(count: int) -> tuple[list[slice], int]:
+    """The chunks of `count` trials, and the size that each is filled up to."""
+    step = -(-count // -(-count // CHUNK))
+    chunks = [slice(first, first + step) for first in range(0, count, step)]
+    return chunks, -(-step // ALIKE) * ALIKE
 
 
 def plain(model: Model) -> Model:

@@ -15,10 +15,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxhand import evaluation, ik, sparse_fit, tracker
+from jaxhand import evaluation, ik, sparse_fit
 from jaxhand import sequences as data
 from jaxhand.compiled import compiled
 from jaxhand.evaluation import Cell, Report, Starts, interval
+from jaxhand.geometry import kabsch
+from jaxhand.joints import joint_stage
+from jaxhand.output import wrist_pose
 from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from jaxhand.sparse_fit import PosePrior
 from jaxhand.tasks import JOINT_POINTS
@@ -270,24 +273,36 @@ def joint_errors(model: Model, dataset: data.Dataset) -> dict[str, dict[str, Cel
     return result
 
 
-def evaluate_poses(model: Model, markers: Array) -> HandPose:
-    """The tracker's output on complete frames `[N, M, 3]`, each as a first frame."""
-    # Alignment as the model has it.
-    model = replace(evaluation.plain(model), predictor="affine", joints="learned")
+class Poses(NamedTuple):
+    """Fields of `HandPose`, `[N]` of each."""
+
+    wrist_rotation: Array
+    wrist_position: Array
+    angles: Array
+    rotations: Array
+    positions: Array
+
+
+def evaluate_poses(model: Model, markers: Array) -> Poses:
+    """What the tracker says of the hand in complete frames `[N, M, 3]`, each as a first frame."""
+    model = replace(model, joints="learned")
     chunks, size = evaluation.chunked(len(markers))
-    visible, dt = jnp.ones((size, len(model.hand)), bool), jnp.zeros(size)
     parts = []
-    for first in chunks:
-        part = markers[first : first + size]
-        pose = _pose(model, jnp.asarray(evaluation.padded(part, size), jnp.float32), visible, dt)
-        parts.append([np.asarray(array)[: len(part)] for array in pose])
-    return HandPose(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    for chunk in chunks:
+        part = markers[chunk]
+        poses = _poses(model, jnp.asarray(evaluation.padded(part, size), jnp.float32))
+        parts.append([np.asarray(array)[: len(part)] for array in poses])
+    return Poses(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
 @compiled
-def _pose(model: Model, markers: Array, visible: Array, dt: Array) -> HandPose:
-    state = tracker.init(model, (len(markers),))
-    return tracker.step(model, state, markers, visible, dt)[1]
+def _poses(model: Model, markers: Array) -> Poses:
+    # Nothing is hidden, so what the tracker gives out is what it is given.
+    template = jnp.asarray(model.hand.template, markers.dtype)
+    eye = jnp.broadcast_to(jnp.eye(3, dtype=markers.dtype), (len(markers), 3, 3))
+    prior = kabsch(template, markers, jnp.ones_like(markers[..., 0]), eye)[0]
+    rotation, position = wrist_pose(model, markers, prior)
+    return Poses(rotation, position, **joint_stage(model, markers, rotation, position))
 
 
 @jax.jit
@@ -376,7 +391,7 @@ def _wrist_errors(
     return off[np.isfinite(off)], block[np.isfinite(off)]
 
 
-def _millimetres(pose: HandPose, position: Array) -> Array:
+def _millimetres(pose: HandPose | Poses, position: Array) -> Array:
     return 1e3 * np.linalg.norm(pose.wrist_position - position, axis=-1)
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,32 +11,21 @@ import pytest
 pytest.importorskip("jax")
 pytest.importorskip("matplotlib")
 
-from jaxhand import demo
+from jaxhand import cli, demo
 from numpy_infer.model import load
 from numpy_infer.recordings import read
 from numpy_infer.tracking import track
 
-ROOT = Path(__file__).resolve().parents[1]
-RUN = "import sys; from jaxhand.cli import demo; sys.exit(demo(sys.argv[1:]))"
 
-
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", RUN, *arguments],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-
-
-def test_the_short_demo_makes_all_it_promises(tmp_path: Path) -> None:
+def test_the_short_demo_makes_all_it_promises(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "demo"
-    result = run("--short", "--out", str(out))
-    assert result.returncode == 0, result.stderr
+    assert cli.demo(["--short", "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
     assert sorted(path.name for path in out.iterdir()) == sorted(demo.FILES)
     for words in ("1 marker hidden", "cm", "ms per frame", "What next", "jaxhand track"):
-        assert words in result.stdout
+        assert words in printed
     table = json.loads((out / "table3.json").read_text("utf-8"))["table3"]
     assert table["learned"]["1"]["0.5"]["mean"] > 0
 
@@ -48,9 +35,8 @@ def test_the_short_demo_makes_all_it_promises(tmp_path: Path) -> None:
 
     # A second demo leaves the first alone.
     before = (out / "model.npz").read_bytes()
-    again = run("--short", "--out", str(out))
-    assert again.returncode == 2
-    assert "--overwrite" in again.stderr
+    assert cli.demo(["--short", "--out", str(out)]) == 2
+    assert "--overwrite" in capsys.readouterr().err
     assert (out / "model.npz").read_bytes() == before
 
 

@@ -414,6 +414,7 @@ SMALL = a_model("affine", dtype=np.float32)
 
 
 @given(seed=seeds(), pattern=st.sampled_from(sorted(PATTERNS)))
+@example(seed=465418, pattern="restless")  # a fit by so few, in a marker that is not refused
 def test_jax_decides_as_numpy_does_in_either_precision(seed: int, pattern: str) -> None:
     what = faulty(MODELS["glove9"], seed, pattern)
     accepted, state = scanned(SMALL, what)
@@ -421,9 +422,9 @@ def test_jax_decides_as_numpy_does_in_either_precision(seed: int, pattern: str) 
         reference, own = run(model, given_)
         np.testing.assert_array_equal(accepted, reference)
         for name, value in own._asdict().items():
-            # Velocities are differences of two roundings of a metre, over a frame; a leap is what a
-            # fit leaves that may go by three markers near a line, and turn by many roundings.
-            atol = 1e-4 if name in ("velocity", "leap") else 1e-5
+            # Velocities are differences of two roundings of a metre, over a frame; others are what
+            # a fit leaves that may go by three markers near a line, and turn by many roundings.
+            atol = 1e-4 if name in ("velocity", "leap", "restless") else 1e-5
             np.testing.assert_allclose(getattr(state, name), value, atol=atol, err_msg=name)
 
 
