@@ -44,6 +44,15 @@ def test_plain_csv_may_be_in_quotes(put: Callable) -> None:
     np.testing.assert_array_equal(found.time, expected.time)
 
 
+def test_plain_csv_may_be_saved_where_commas_are_decimal(put: Callable) -> None:
+    saved = "# unit: mm;;;;;;\ntime;a.x;a.y;a.z;b.x;b.y;b.z\n0;1;2;3;4;5,25;6\n0,01;;;;4;5;7\n"
+    expected = read(put("take.csv", CSV.replace("4,5,6", "4,5.25,6")))
+    found = read(put("saved.csv", saved))
+    assert found.names == expected.names
+    np.testing.assert_array_equal(found.markers, expected.markers)
+    np.testing.assert_array_equal(found.time, expected.time)
+
+
 def test_a_time_that_does_not_go_with_the_stated_rate_is_noted(put: Callable) -> None:
     text = "# unit: m\n# rate: {}\ntime,a.x,a.y,a.z\n" + "".join(
         f"{time},1,2,3\n" for time in np.round(np.arange(200) / 120, 2)

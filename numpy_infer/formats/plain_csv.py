@@ -9,7 +9,8 @@
 
 Comment lines come first; `unit` must be there or be given, `rate` and `frames` are optional. A
 blank or NaN cell is a gap; so are three exact zeros in a file whose markers jump there, unless it
-says `# gaps: blank`, as those that we write do. Quotes about cells are left out. Of what tracking
+says `# gaps: blank`, as those that we write do. Quotes about cells are left out; semicolons between
+columns, and decimal commas, are what spreadsheets make of it in half of the world. Of what tracking
 adds `NAME.status` is read, where numbers other than 0 say that the marker was filled, and the rest
 with a note alone: columns that end in `.deg` (joint angles) or `.pose`, and of each marker
 `NAME.expected_error`, in the file's unit. The markers of a file that we write read back bit for
@@ -48,6 +49,10 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     """Read a plain CSV file; ValueError names file and line."""
     file = read_text(path)
     file = replace(file, lines=[line.replace('"', "") for line in file.lines])
+    first = next((line for line in file.lines if not line.startswith("#")), "")
+    if ";" in first and "," not in first:
+        swap = str.maketrans(",;", ".,")
+        file = replace(file, lines=[line.translate(swap) for line in file.lines])
     comments, header = _comments(file)
     cells = _header(file, header)
     names, columns, notes = _columns(file, header, cells)
@@ -149,10 +154,8 @@ def _header(file: TextFile, index: int) -> tuple[str, ...]:
         )
     cells = file.cells(index, ",")
     if cells[0] != "time":
-        apart = next((c for c in ";\t" if c in line and "," not in line), None)
-        found = (
-            repr(cells[0]) if apart is None else f"columns separated by {apart!r}, not by commas"
-        )
+        tabs = "\t" in line and "," not in line
+        found = "columns separated by tabs, not by commas" if tabs else repr(cells[0])
         raise file.error(
             index,
             f"expected the first column to be time, found {found}; the header is "
