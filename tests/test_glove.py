@@ -221,7 +221,7 @@ def test_a_size_that_nothing_tells_is_not_told() -> None:
     )
     for factor, seen, told in (
         (1.1, True, "the hand is +10.0 % of the model's (95 %: +9.0 to +11.0)"),
-        (1.0, True, "the hand is +10.0 % of the model's (95 %: +9.0 to +11.0): not surely 1 %"),
+        (1.0, True, "the hand is +10.0 % of the model's (95 %: +9.0 to +11.0): not surely 3 %"),
         (1.0, False, "no finger moved enough to tell the hand's size: the model's own is kept"),
     ):
         size = Size(factor, 1.1, (1.09, 1.11), 0.01, np.array([seen, *[False] * 4]))
