@@ -83,14 +83,15 @@ def collect(config: TrainingConfig) -> Given:
 
 
 def _digest(config: TrainingConfig, datasets: list[Dataset]) -> str:
-    """The takes with their lengths and gaps, and the bytes of files that are not recordings: what
-    another release of a library reads alike."""
+    """The takes with their lengths, their gaps and where they are to the millimetre, and the bytes
+    of files that are not recordings: what another release of a library reads alike."""
     said: list[Any] = []
     for dataset in datasets:
         said.append([dataset.name, dataset.weight])
-        said += [
-            [s.name, len(s.markers), int(np.isfinite(s.markers).sum())] for s in dataset.sequences
-        ]
+        for s in dataset.sequences:
+            where = 1e3 * np.nan_to_num(s.markers).mean((0, 1))
+            said.append([s.name, len(s.markers), int(np.isfinite(s.markers).sum())])
+            said.append(where.round().astype(int).tolist())
     for path in (config.hand, config.start, config.occlusions):
         if isinstance(path, str | Path) and Path(path).is_file():
             said.append(hashlib.sha256(Path(path).read_bytes()).hexdigest())

@@ -180,7 +180,11 @@ def test_other_files_under_the_same_paths_are_noticed(
     blind[3, 2] = np.nan
     sequences = (replace(first, markers=blind), *held["dataset"].sequences[1:])
     held["dataset"] = replace(held["dataset"], sequences=sequences)
-    assert len({before, other_gaps, other_start, other_bones, digest()}) == 5
+    blinded = digest()
+    sequences = (replace(first, markers=blind + 0.1), *sequences[1:])
+    held["dataset"] = replace(held["dataset"], sequences=sequences)
+    moved = digest()
+    assert len({before, other_gaps, other_start, other_bones, blinded, moved}) == 6
 
 
 @pytest.mark.usefixtures("made")
