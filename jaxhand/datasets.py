@@ -147,7 +147,8 @@ def load(
     chosen = source.splits(tuple(files)).get(split, ()) if takes is None else takes
     unknown = [take for take in chosen if take not in files]
     if unknown or not chosen:
-        lacks = f"no take {', '.join(unknown)}" if unknown else f"no default {split!r} split"
+        few = "fewer than three takes have " if spec.name == OWN else ""
+        lacks = f"no take {', '.join(unknown)}" if unknown else f"{few}no default {split!r} split"
         raise ValueError(
             f"{spec.path}: {lacks}; name takes with --{split}, out of: {', '.join(sorted(files))}"
         )
