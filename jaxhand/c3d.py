@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import struct
 from pathlib import Path
 from types import ModuleType
@@ -19,10 +20,14 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     """Read the points of a C3D file; a residual below 0 is a gap. Time starts at 0."""
     contents = _open(_ezc3d(), Path(path))
     parameters = contents["parameters"]["POINT"]
-    scale = agreed(path, metres_per(_text(path, parameters, "UNITS"), str(path)), unit)
+    stated = _text(parameters, "UNITS")
+    scale = agreed(path, metres_per(stated, str(path)) if stated else None, unit)
     points = contents["data"]["points"][:3]  # [3, M, T]
     residuals = contents["data"]["meta_points"]["residuals"][0]  # [M, T]
-    labels = [str(label).strip() for label in parameters["LABELS"]["value"]]
+    # A parameter holds 255 of them; LABELS2 goes on, and so forth.
+    parts = sorted(key for key in parameters if re.fullmatch("LABELS[0-9]*", key))
+    parts = sorted(parts, key=lambda key: int(key.removeprefix("LABELS") or 1))
+    labels = [str(label).strip() for key in parts for label in parameters[key]["value"]]
     frames, rate = points.shape[2], float(parameters["RATE"]["value"][0])
     _check_labels(path, labels, points.shape)
     # ezc3d makes these NaN of its own accord; what the format promises is the residual.
@@ -49,7 +54,10 @@ def write(recording: Recording, path: Path) -> None:
     C3D keeps a rate and no times: ValueError if the recording's frames are not evenly spaced.
     """
     drift = np.diff(recording.time) * recording.rate - 1.0
-    if (np.abs(drift) > 0.01).any():
+    # Rounded times differ from step to step, and lead nowhere.
+    frames = (recording.time - recording.time[0]) * recording.rate
+    astray = np.abs(frames - np.arange(len(frames))) > 0.1
+    if (np.abs(drift) > 0.01).any() and astray.any():
         raise ValueError(
             f"C3D holds evenly spaced frames only; frame {int(np.argmax(np.abs(drift))) + 1} is "
             f"not 1/{recording.rate:g} s after the one before: resample, or write TRC or CSV"
@@ -110,11 +118,9 @@ def _check_length(path: Path) -> None:
         )
 
 
-def _text(path: Path, parameters: Any, key: str) -> str:
+def _text(parameters: Any, key: str) -> str:
     values = parameters[key]["value"] if key in parameters else []
-    if not values or not str(values[0]).strip():
-        raise ValueError(f"{path}: POINT:{key} is missing")
-    return str(values[0])
+    return str(values[0]).strip() if values else ""
 
 
 def _check_labels(path: Path, labels: list[str], shape: tuple[int, ...]) -> None:

@@ -19,7 +19,7 @@ from jaxhand.arrow import Priors, Problem, State
 from jaxhand.motion import DIP_SHARE
 from numpy_infer import geometry
 from numpy_infer import skeleton as runtime
-from numpy_infer.arrays import Array
+from numpy_infer.arrays import Array, floats
 from numpy_infer.hand import (
     ANGLES,
     CHAINS,
@@ -140,7 +140,7 @@ def calibrate(
         ValueError: another shape, no frame, a rate or noise not above 0, a smoothness below it, an
             unknown entry of `fixed`, or nowhere three alignment markers that are not in line.
     """
-    markers = np.array(markers, np.float64)
+    markers = np.array(floats(markers))
     _check(hand, markers, rate, fixed, noise, smoothness)
     markers[~np.isfinite(markers).all(-1)] = np.nan
     frames = np.arange(len(markers))
@@ -179,9 +179,9 @@ def _check(
         expected = f"[T, {len(hand)}, 3] with T above 0"
         raise ValueError(f"markers: expected shape {expected}, got {list(markers.shape)}")
     for name, value in (("rate", rate), ("noise", noise or (1 if noise is None else 0))):
-        if not value > 0:
+        if not 0 < value < np.inf:
             raise ValueError(f"{name}: expected a number above 0, got {value}")
-    if not smoothness >= 0:
+    if not 0 <= smoothness < np.inf:
         raise ValueError(f"smoothness: expected a number not below 0, got {smoothness}")
     if unknown := sorted(set(fixed) - {"bones", "offsets"}):
         raise ValueError(f"fixed: expected 'bones' and 'offsets', got {unknown}")

@@ -381,13 +381,6 @@ def spells(draws: Array, what: Spells, rate: float) -> tuple[Array, Array]:
     return now < ends, jax.lax.cummax(jnp.where(begins, now, 0), draws.ndim - 2)
 
 
-def neighbours(hand: Hand) -> Array:
-    """`[P, 2]` indices of markers that a tracking system takes for each other: the outermost ones
-    of fingers side by side."""
-    pairs = np.stack([hand.end_markers[0][:-1], hand.end_markers[0][1:]], -1)
-    return pairs[(pairs >= 0).all(-1)]
-
-
 def misplace(
     key: Array, markers: Array, visible: Array, rate: float, pairs: Array, faults: Faults
 ) -> tuple[Array, Array, Array]:
@@ -398,7 +391,7 @@ def misplace(
         markers: `[..., T, M, 3]` metres, world: the truth, finite also where hidden.
         visible: `[..., T, M]` True where measured.
         rate: frames per second.
-        pairs: `[P, 2]` markers whose labels may be swapped, see `neighbours`.
+        pairs: `[P, 2]` markers whose labels may be swapped, see `reach.neighbours`.
         faults: how many there are of each kind.
 
     Returns:

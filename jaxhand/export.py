@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import jax
 import numpy as np
@@ -117,19 +118,23 @@ def export(model: Model, path: str | Path, *, overwrite: bool = False) -> Model:
 
     Raises:
         ValueError: the file exists and `overwrite` is False; or the outputs differ, which leaves
-            no file behind.
+            what was there.
     """
     path = Path(path)
-    model_file.save(model, path, overwrite=overwrite)
-    back = model_file.load(path)
-    for name in ("marker_network", "joint_network"):
-        trained, read = getattr(model, name), getattr(back, name)
-        if trained is not None and (difference := _difference(trained, read)) > PARITY:
-            path.unlink()
-            raise ValueError(
-                f"{name}: numpy and JAX differ by {difference:.1e} of the outputs' spread, "
-                f"expected at most {PARITY:.0e}"
-            )
+    if path.exists() and not overwrite:
+        raise ValueError(f"{path} exists: choose another name, or ask to overwrite it")
+    with TemporaryDirectory(dir=path.parent, prefix=".jaxhand-") as folder:
+        written = Path(folder) / path.name
+        model_file.save(model, written)
+        back = model_file.load(written)
+        for name in ("marker_network", "joint_network"):
+            trained, read = getattr(model, name), getattr(back, name)
+            if trained is not None and (difference := _difference(trained, read)) > PARITY:
+                raise ValueError(
+                    f"{name}: numpy and JAX differ by {difference:.1e} of the outputs' spread, "
+                    f"expected at most {PARITY:.0e}"
+                )
+        written.replace(path)
     return back
 
 

@@ -20,8 +20,8 @@ from jaxhand.skeleton import forward_kinematics, rotations_from_angles
 from numpy_infer.arrays import Array
 from numpy_infer.finger_forms import JOINT_AXES
 from numpy_infer.hand import (
+    ANGLE_AT,
     ANGLES,
-    ANGLES_OF_FINGER,
     CHAINS,
     FINGER_OF_ANGLE,
     FINGERS,
@@ -52,9 +52,7 @@ tip lies aside, which hinges cannot express, from being twisted by 70°."""
 REST_EVERY, REST_ROUNDS = 10, 2
 """Every how many-th frame the bones' rest directions are taken from, and rounds of it."""
 
-_WIDTH = max(map(len, ANGLES_OF_FINGER))
-_ANGLE = np.array([(own + [len(ANGLES)] * _WIDTH)[:_WIDTH] for own in ANGLES_OF_FINGER])
-"""`[5, 6]` the angle at each finger's slot; 26 stands for a slot that the finger does not use."""
+_WIDTH = ANGLE_AT.shape[1]
 _POINT = np.array(CHAINS)[:, 1:]
 """`[5, 3]` the points of each finger that its angles move."""
 
@@ -227,7 +225,7 @@ def _information(skeleton: Array, angles: Array) -> Array:
         rows = _jacobian(residuals, jnp.clip(angles, _LOW, _HIGH))
         return product(rows, jnp.swapaxes(rows, -1, -2))
 
-    unused = jnp.asarray(len(ANGLES) == _ANGLE, jnp.float32)
+    unused = jnp.asarray(len(ANGLES) == ANGLE_AT, jnp.float32)
     return jax.lax.map(information, angles) + unused[..., None] * jnp.eye(_WIDTH)
 
 
@@ -246,7 +244,7 @@ def _priors(angles: Array) -> Array:
     """`[5, 12]` twists and trespasses, in standard deviations; 0 in a slot that is not used."""
     beyond = angles - jnp.clip(angles, _LOW, _HIGH)
     both = jnp.stack([angles * _TWIST / TWIST_PRIOR, beyond / RANGE_PRIOR])
-    both = jnp.concatenate([both, jnp.zeros((2, 1))], -1)[:, _ANGLE]
+    both = jnp.concatenate([both, jnp.zeros((2, 1))], -1)[:, ANGLE_AT]
     return jnp.concatenate([both[0], both[1]], -1)
 
 

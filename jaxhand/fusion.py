@@ -22,10 +22,11 @@ import jaxhand.networks  # noqa: F401  makes `Hand` an argument that jit underst
 from jaxhand.geometry import kabsch, product, second_extent, transform, untransform
 from jaxhand.ik import in_hand_frame
 from jaxhand.skeleton import align_fingers, angles_from_rotations, rotations_from_angles
-from numpy_infer.arrays import Array
+from numpy_infer.arrays import Array, floats
 from numpy_infer.geometry import kabsch as numpy_kabsch
 from numpy_infer.geometry import mirror, mirror_rotation, nearest_rotation, shortest_arc
 from numpy_infer.hand import (
+    ANGLE_AT,
     ANGLES,
     CHAINS,
     FINGER_OF_ANGLE,
@@ -66,19 +67,16 @@ AUTHORS_JOINTS = {
 }
 """The joints of the paper authors' files → ours."""
 
-_WIDTH = int(SLOT_OF_ANGLE.max()) + 1
-_ANGLE = np.full((len(FINGERS), _WIDTH), len(ANGLES))
-_ANGLE[FINGER_OF_ANGLE, SLOT_OF_ANGLE] = np.arange(len(ANGLES))
-"""`[5, 6]` the angle at each finger's slot; 26 stands for a slot that the finger does not use."""
+_WIDTH = ANGLE_AT.shape[1]
 _BASES = np.array(CHAINS)[:, 0]
 _PARENTS = np.array(PARENTS)[1 : len(JOINTS)]
 
 _KIND = np.array([angle.name.rpartition("_")[2] for angle in ANGLES] + ["none"])
 _FLEXION = _KIND[:-1] == "flexion"
-_FELT = (_KIND == "flexion")[_ANGLE]
+_FELT = (_KIND == "flexion")[ANGLE_AT]
 """`[5, 6]` True for flexions, which a glove feels."""
 _SPREAD = {"abduction": ABDUCTION_SPREAD, "twist": TWIST_SPREAD}
-_UNFELT_VARIANCE = np.array([_SPREAD.get(k, 0) ** 2 for k in _KIND], np.float32)[_ANGLE]
+_UNFELT_VARIANCE = np.array([_SPREAD.get(k, 0) ** 2 for k in _KIND], np.float32)[ANGLE_AT]
 """`[5, 6]` of the others, about what the glove says."""
 
 
@@ -235,14 +233,14 @@ def simulate_imu(
 
 
 def _run(method: Callable[..., Fused], hand: Hand, imu: Array, markers: Array, dt: Array) -> Fused:
-    markers, imu, dt = np.asarray(markers), np.asarray(imu), np.asarray(dt)
+    markers, imu, dt = floats(markers), floats(imu), np.asarray(dt)
     frames = markers.shape[:1]
     for name, array, shape in (
         ("markers", markers, (*frames, len(hand), 3)),
         ("imu_rotations", imu, (*frames, len(JOINTS) - 1, 3, 3)),
         ("dt", dt, frames if dt.ndim else ()),
     ):
-        if array.shape != shape or not frames:
+        if array.shape != shape or not all(frames):
             raise ValueError(f"{name}: expected shape {list(shape)}, got {list(array.shape)}")
     if not np.isfinite(dt).all():
         raise ValueError("dt: expected finite seconds")
@@ -317,7 +315,7 @@ def _fuse(hand: Hand, imu: Array, markers: Array, seen: Array, dt: Array) -> Fus
         output = state.output + jnp.clip(mean - state.output, -slew, slew)
         return _Filter(mean, covariance, output, rotation, position), (output, rotation, position)
 
-    none = jnp.zeros(_ANGLE.shape)
+    none = jnp.zeros(ANGLE_AT.shape)
     variance = jnp.where(_FELT, FLEXION_OFFSET**2, _UNFELT_VARIANCE)
     first = jnp.argmax(determined)
     start = _Filter(

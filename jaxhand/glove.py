@@ -13,6 +13,7 @@ from rich.console import Console
 
 from jaxhand.calibration import DENSE, Calibration, Priors, calibrate
 from jaxhand.hand_size import ALIKE, SIZES, Size, hand_size
+from jaxhand.hand_size import FAR as FARTHEST
 from jaxhand.joint_evaluation import evaluate_poses
 from jaxhand.options import Unit
 from numpy_infer import wearer
@@ -163,7 +164,7 @@ def describe_glove(config: HandConfig, console: Console | None = None) -> None:
 
 
 def _read(config: _File) -> Recording:
-    check_output(config.out, overwrite=config.overwrite)
+    check_output(config.out, overwrite=config.overwrite, inputs=[config.recording])
     if config.left_prefix and (config.right or config.right_prefix):
         raise ValueError("one hand at a time: --left-prefix goes without --right, --right-prefix")
     return read(
@@ -171,6 +172,7 @@ def _read(config: _File) -> Recording:
         unit=config.unit,
         left_handed=config.left_handed,
         label_map=load_label_map(config.map) if config.map else None,
+        prefixes=(config.left_prefix, config.right_prefix),
     ).measured()
 
 
@@ -261,7 +263,7 @@ def _bones(found: Calibration, model: Hand, config: _File) -> list[str]:
     return [
         f"{len(found.tracked)} frames; markers fit within {1e3 * off:.1f} mm on average (usual: up "
         "to 3 mm)",
-        f"bones are {100 * (now.sum() / before.sum() - 1):+.1f} % of the model's in all",
+        f"bones are {_larger(now.sum() / before.sum())} than the model's in all",
         *(
             f"  {point:11} {1e3 * new:5.1f} mm ({1e3 * (new - old):+.1f})"
             for point, new, old in zip(POINTS[1:], now, before, strict=True)
@@ -273,19 +275,22 @@ def _bones(found: Calibration, model: Hand, config: _File) -> list[str]:
 def _of_size(size: Size, config: _File) -> list[str]:
     """What is said of a hand's size."""
     low, high = (100 * (end - 1) for end in size.interval)
-    text = (
-        f"the hand is {100 * (size.likeliest - 1):+.1f} % of the model's (95 %: {low:+.1f} to "
-        f"{high:+.1f})"
-    )
+    between = f"(95 %: {low:+.1f} to {high:+.1f})"
+    text = f"the hand is {_larger(size.likeliest)} than the model's {between}"
     if not size.seen.any():
         text = "no finger moved enough to tell the hand's size: the model's own is kept"
     elif size.factor == 1:
         text += f": not surely {100 * ALIKE:g} % from the model's own, which is kept"
     return [
         text,
-        f"markers fit within {1e3 * size.off:.1f} mm, root mean square (usual: 5 to 15 mm)",
+        f"markers fit within {1e3 * size.off:.1f} mm, root mean square (usual: 5 to 15 mm, and no "
+        f"marker counts as more than {1e3 * FARTHEST:.0f})",
         *_poor(size.off > FAR, size.likeliest, config),
     ]
+
+
+def _larger(factor: float) -> str:
+    return f"{100 * abs(factor - 1):.1f} % {'larger' if factor > 1 else 'smaller'}"
 
 
 def _poor(far: bool, factor: float, config: _File) -> list[str]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxhand.calibration import FLEXIONS, MOVED
 from jaxhand.joint_evaluation import evaluate_poses
-from numpy_infer.arrays import Array
+from numpy_infer.arrays import Array, floats
 from numpy_infer.hand import FINGER_OF_ANGLE, FINGERS, SLOT_OF_ANGLE
 from numpy_infer.model import Model
 from numpy_infer.skeleton import marker_positions
@@ -45,7 +45,8 @@ class Size(NamedTuple):
     interval: tuple[float, float]
     """95 %, from blocks of the recording. What one number cannot say of a hand is not in it."""
     off: float
-    """Metres: root mean square distance of measured markers from where the model puts them."""
+    """Metres: root mean square distance of measured markers from where the model puts them, none
+    taken for farther off than `FAR`."""
     seen: Array
     """`[5]` by finger: True once it has moved enough to say how far it reaches."""
 
@@ -62,6 +63,7 @@ def hand_size(model: Model, markers: Array) -> Size:
     """
     if model.joint_network is None:
         raise ValueError("the model has no joint network, so there is nothing to calibrate")
+    markers = floats(markers)
     complete = np.flatnonzero(np.isfinite(markers).all((-1, -2)))
     if len(complete) < FEWEST:
         raise ValueError(

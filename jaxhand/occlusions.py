@@ -27,6 +27,7 @@ from jaxhand.pictures import check_picture, occlusions_picture
 from jaxhand.two_hands import two_hands
 from numpy_infer.arrays import Array
 from numpy_infer.cli import check_output
+from numpy_infer.formats.json_text import read_json
 from numpy_infer.hand import Hand, bundled, load_hand
 from numpy_infer.labels import advice
 from numpy_infer.recordings import Recording, load_label_map, read
@@ -36,6 +37,12 @@ QUANTILES = (0.05, 0.1, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
 
 FEWEST_LEFT = 3
 """Markers that are never hidden: fewer do not determine a registration."""
+
+SAME_RATE = 0.01
+"""Rates that differ by a smaller part are taken for one."""
+
+LARGEST = 1e15
+"""No number in a file of gaps is larger."""
 
 ONE, TWO = "one hand", "two hands"
 """Names of tables: of recordings with one hand, and with two."""
@@ -156,7 +163,7 @@ def load(path: str | Path) -> dict[str, Occlusions]:
     """
     tables, at = {}, ""
     try:
-        data = json.loads(Path(path).read_text("utf-8"))
+        data = read_json(Path(path))
         _check_keys("a file of occlusions", data, ("format", "version", "tables"))
         kind = [data["format"], data["version"]]
         _check("format, version", kind == ["jaxhand-occlusions", 1], "jaxhand-occlusions 1", kind)
@@ -167,7 +174,7 @@ def load(path: str | Path) -> dict[str, Occlusions]:
             tables[name] = occlusions_from_json(row)
     except FileNotFoundError:
         raise ValueError(f"no file of gaps {path}: jaxhand occlusions --json writes one") from None
-    except (ValueError, RecursionError) as error:  # no UTF-8, no JSON, too deep, no statistics
+    except ValueError as error:
         raise ValueError(f"{path}: {at}{error}") from None
     return tables
 
@@ -317,7 +324,8 @@ def occlusions(config: OcclusionsConfig, console: Console | None = None) -> dict
     """
     console = console or Console(soft_wrap=True, highlight=False)
     if config.json is not None:
-        check_output(config.json, overwrite=config.overwrite)
+        inputs = list(map(Path, config.files))
+        check_output(config.json, overwrite=config.overwrite, inputs=inputs)
     if config.picture is not None:
         check_picture(config.picture, overwrite=config.overwrite)
     if not config.files:
@@ -355,21 +363,28 @@ def _simulated(config: OcclusionsConfig) -> dict[str, Occlusions]:
 def _recorded(config: OcclusionsConfig, console: Console) -> dict[str, Occlusions]:
     label_map = load_label_map(config.map) if config.map else None
     seen: dict[str, list[Array]] = {}
-    layouts = set()
+    markers: tuple[str, ...] = ()
+    first: Recording | None = None
     for file in config.files:
         recording = read(
             file, unit=config.unit, left_handed=config.left_handed, label_map=label_map
         ).measured()
         hand, hands = hands_in(recording, config.hand, config.left_prefix, config.right_prefix)
-        layouts.add((hand.markers, recording.rate))
-        if len(layouts) > 1:
-            raise ValueError(f"{file}: other markers or another rate than in the files before")
+        first, markers = first or recording, markers or hand.markers
+        if hand.markers != markers:
+            raise ValueError(f"{file}: other markers than in the files before")
+        # Rounded times make rates that differ in their third digit.
+        if abs(recording.rate / first.rate - 1) > SAME_RATE:
+            raise ValueError(
+                f"{file}: {recording.rate:g} Hz, and {first.rate:g} in the files before: gaps are "
+                "counted in frames, so count files of one rate at a time"
+            )
         console.print(f"{file}: {len(hands)} × {hand.name}, {recording.rate:g} Hz")
         for note in recording.notes:
             console.print(f"note: {note}")
         seen.setdefault(ONE if len(hands) == 1 else TWO, []).extend(hands)
-    markers, rate = layouts.pop()
-    return {name: statistics(markers, rate, hands) for name, hands in sorted(seen.items())}
+    assert first is not None  # there is a file
+    return {name: statistics(markers, first.rate, hands) for name, hands in sorted(seen.items())}
 
 
 def hands_in(
@@ -451,5 +466,6 @@ def _check_keys(what: str, data: Any, known: Collection[str]) -> None:
 def _number(name: str, value: Any, of: type) -> Any:
     """One value of a kind; in Python true is an integer."""
     fits = isinstance(value, (int, float) if of is float else of) and not isinstance(value, bool)
+    fits = fits and (isinstance(value, str) or abs(value) <= LARGEST)  # of NaN false
     _check(name, fits, {str: "a string", int: "a whole number"}.get(of, "a number"), value)
     return of(value)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from numpy_infer.formats.json_text import read_json
 from numpy_infer.formats.units import metres
 from numpy_infer.networks import Dense, Spec, read_spec
 
@@ -51,7 +51,7 @@ def read_layers(text: str) -> Spec:
     """
     if text.endswith(".json"):
         try:
-            layers = json.loads(Path(text).read_text("utf-8"))
+            layers = read_json(Path(text))
         except (OSError, ValueError) as error:
             raise ValueError(f"layers {text}: {error}") from None
         if not isinstance(layers, list):

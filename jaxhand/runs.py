@@ -11,6 +11,8 @@ from typing import Any
 
 import orbax.checkpoint as orbax
 
+from numpy_infer.formats.json_text import read_json
+
 OWN = ("config.json", "metrics.jsonl", "checkpoints", "model.npz")
 """What a run's folder holds."""
 
@@ -43,7 +45,12 @@ def check(folder: Path, config: Mapping[str, Any]) -> None:
         )
     if not (folder / "config.json").exists():
         raise ValueError(f"{folder} holds no run to resume: pass another --out")
-    before = json.loads((folder / "config.json").read_text("utf-8"))
+    try:
+        before = read_json(folder / "config.json")
+    except ValueError as error:
+        raise ValueError(f"{folder / 'config.json'}: {error}; pass another --out") from None
+    if not isinstance(before, dict):
+        raise ValueError(f"{folder / 'config.json'} is no run's: pass another --out")
     for name, now in config.items():
         if name == DIGEST and before.get(name) != now:
             raise ValueError(
@@ -63,7 +70,9 @@ def create(folder: Path, config: Mapping[str, Any]) -> None:
             shutil.rmtree(part)
         else:
             part.unlink(missing_ok=True)
-    (folder / "config.json").write_text(json.dumps(config, indent=1) + "\n", "utf-8")
+    part = folder / "config.json.part"
+    part.write_text(json.dumps(config, indent=1) + "\n", "utf-8")
+    part.replace(folder / "config.json")
 
 
 def checkpoints(folder: Path | None, network: str) -> Any:

@@ -89,7 +89,7 @@ def _digest(config: TrainingConfig, datasets: list[Dataset]) -> str:
     for dataset in datasets:
         said.append([dataset.name, dataset.weight])
         for s in dataset.sequences:
-            where = 1e3 * np.nan_to_num(s.markers).mean((0, 1))
+            where = 1e3 * np.nan_to_num(s.markers).mean(0)
             said.append([s.name, len(s.markers), int(np.isfinite(s.markers).sum())])
             said.append(where.round().astype(int).tolist())
     for path in (config.hand, config.start, config.occlusions):

@@ -230,10 +230,10 @@ def scenes(draws: Array, people: People) -> tuple[Array, Array]:
     near = meet.at[..., 26:29].add(jnp.asarray(_AWAYS)[scene][..., None, :, :] / 1e3)
     opened = meet[..., :26] + OPEN * (jnp.asarray(motion.RELEASE) - meet[..., :26])
     near = near.at[..., :26].set(opened)
-    apart = jnp.array(APART) + jnp.array(APART_SPREAD) * off[..., :1, :, :3]
-    apart_turn = jnp.array(APART_TURN) * off[..., :1, :, 3:]
-    apart = jnp.concatenate([angles[..., :1, :, :], apart, apart_turn], -1)
-    stops = [apart, near[..., :1, :, :], meet, near[..., 1:, :, :]]
+    away = jnp.array(APART) + jnp.array(APART_SPREAD) * off[..., :1, :, :3]
+    away_turn = jnp.array(APART_TURN) * off[..., :1, :, 3:]
+    away = jnp.concatenate([angles[..., :1, :, :], away, away_turn], -1)
+    stops = [away, near[..., :1, :, :], meet, near[..., 1:, :, :]]
     return jnp.concatenate(stops, -3), scene
 
 

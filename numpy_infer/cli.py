@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from importlib.metadata import entry_points, version
 from pathlib import Path
@@ -25,6 +26,7 @@ from numpy_infer.labels import (
     labels_of,
     prefixed,
     unfitting,
+    unusual_size,
     without,
 )
 from numpy_infer.model import Model, load
@@ -37,7 +39,7 @@ from numpy_infer.recordings import (
     doubted_time,
     load_label_map,
     read,
-    write,
+    write_all,
     writer_of,
 )
 from numpy_infer.tracking import Tracked, as_measured, track, track_hands
@@ -183,16 +185,17 @@ def parser() -> argparse.ArgumentParser:
     return top
 
 
-def check_output(path: Path, *, overwrite: bool) -> None:
+def check_output(path: Path, *, overwrite: bool, inputs: Collection[Path] = ()) -> None:
     """Refuses, before the work, a file that could not be written after it.
 
     Args:
         path: the file to write.
         overwrite: it may be there already.
+        inputs: what is read, which it may not be.
 
     Raises:
-        ValueError: it exists, it is a folder, or it would stand in none, or where nothing may be
-            written.
+        ValueError: it exists, it is a folder or an input, or it would stand in none, or where
+            nothing may be written.
     """
     if not path.parent.is_dir():
         raise ValueError(f"{path.parent} is no folder: make it first")
@@ -202,6 +205,8 @@ def check_output(path: Path, *, overwrite: bool) -> None:
         raise ValueError(f"{path} is a folder: choose another name")
     if path.exists() and not overwrite:
         raise ValueError(f"{path} exists: choose another name, or pass --overwrite")
+    if path.exists() and any(own.exists() and path.samefile(own) for own in inputs):
+        raise ValueError(f"{path} is the recording itself: choose another name")
 
 
 def _add_file(verb: argparse.ArgumentParser) -> None:
@@ -217,12 +222,13 @@ def _add_file(verb: argparse.ArgumentParser) -> None:
     )
 
 
-def _read(options: argparse.Namespace) -> Recording:
+def _read(options: argparse.Namespace, prefixes: Collection[str] = ()) -> Recording:
     return read(
         options.file,
         unit=None if options.unit is None else metres(options.unit),
         left_handed=options.left_handed,
         label_map=load_label_map(options.map) if options.map else None,
+        prefixes=prefixes,
     ).measured()
 
 
@@ -280,17 +286,22 @@ def describe(recording: Recording) -> dict[str, Any]:
     }
 
 
+_SAYS_RIGHT = r"(?<![A-Za-z])right|Right|RIGHT"
+
+
 def _track(options: argparse.Namespace) -> None:
     if options.smooth is not None and not 0 < options.smooth < np.inf:
         raise ValueError(f"--smooth: expected a cutoff above 0 Hz, got {options.smooth:g}")
+    if options.smooth is not None and options.as_measured:
+        raise ValueError("--as-measured writes what --smooth would smooth: leave one of them out")
     outputs = _outputs(options)
     for output in outputs.values():
         writer_of(output)
-        check_output(output, overwrite=options.overwrite)
-        if output.exists() and output.samefile(options.file):
-            raise ValueError(f"{output} is the recording itself: choose another name")
-    recording = _read(options)
+        check_output(output, overwrite=options.overwrite, inputs=[options.file])
     prefixes = {"left": options.left_prefix or "", "right": options.right_prefix or ""}
+    recording = _read(options, prefixes.values())
+    for note in recording.notes:
+        print(f"jaxhand track: {note}", file=sys.stderr)
     labels = [labels_of(recording, prefixes[side]) for side in outputs]
     model = _model(options, labels[0], prefixes[next(iter(outputs))])
     if options.predictor:
@@ -318,6 +329,8 @@ def _track(options: argparse.Namespace) -> None:
     for hand in hands:
         if doubt := doubted_unit(hand, model.body):
             raise ValueError(f"{options.file}: {doubt}")
+        if told := unusual_size(hand, model.body):
+            print(f"jaxhand track: {told}", file=sys.stderr)
     if told := doubted_time(recording):
         print(f"jaxhand track: {told}", file=sys.stderr)
     if len(hands) == 1:
@@ -329,11 +342,12 @@ def _track(options: argparse.Namespace) -> None:
         print(file=sys.stderr)
     if options.as_measured:
         results = [as_measured(result, hand) for result, hand in zip(results, hands, strict=True)]
+    filled = [result.recording for result in results]
+    write_all(dict(zip(outputs.values(), filled, strict=True)), overwrite=options.overwrite)
     for (side, output), result in zip(outputs.items(), results, strict=True):
-        write(result.recording, output, overwrite=options.overwrite)
         if len(outputs) > 1:
             print(f"{side} hand")
-        elif side == "left" and "right" in options.file.stem.lower():
+        elif side == "left" and re.search(_SAYS_RIGHT, options.file.stem):
             print("tracked as a left hand, though the file's name says right: see --right")
         print(_summary(result))
         print(f"wrote {output}")
@@ -346,6 +360,8 @@ def _outputs(options: argparse.Namespace) -> dict[str, Path]:
         raise ValueError(
             "--right says nothing beside --left-prefix: pass --right-prefix for the other"
         )
+    if options.left_prefix and options.left_prefix == options.right_prefix:
+        raise ValueError("--left-prefix and --right-prefix are the same: which hand is it?")
     if options.left_prefix and options.right_prefix:
         return {side: out.with_stem(f"{out.stem}_{side}") for side in ("left", "right")}
     return {"right" if options.right or options.right_prefix else "left": out}

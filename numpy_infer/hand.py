@@ -96,6 +96,9 @@ FINGER_OF_ANGLE = np.repeat(np.arange(len(FINGERS)), [len(own) for own in ANGLES
 """`[26]` the index in `FINGERS` of the finger that each angle moves."""
 SLOT_OF_ANGLE = np.concatenate([np.arange(len(own)) for own in ANGLES_OF_FINGER])
 """`[26]` its number among that finger's."""
+ANGLE_AT = np.full((len(FINGERS), SLOT_OF_ANGLE.max() + 1), len(ANGLES))
+"""`[5, 6]` the angle at each finger's slot; 26 stands for a slot that the finger does not use."""
+ANGLE_AT[FINGER_OF_ANGLE, SLOT_OF_ANGLE] = np.arange(len(ANGLES))
 FINGER_OF_POINT = np.array([-1, *(i // 3 for i in range(15)), *range(5)])
 """`[21]` the finger of each point; −1 for the wrist."""
 

@@ -12,6 +12,7 @@ from shlex import quote
 import numpy as np
 
 from numpy_infer.arrays import Array
+from numpy_infer.formats.units import METRES
 from numpy_infer.geometry import second_extent
 from numpy_infer.hand import Hand, bundled, load_hand
 from numpy_infer.pose import DETERMINED_EXTENT
@@ -24,6 +25,8 @@ CLOSE = 0.8
 """A label that is so much like a marker's name (`difflib`'s ratio) may be meant for it: one letter
 of five may be wrong. Names of the bundled hands, such as ThumbIP and ThumbTip, are as near each
 other, so a label that is one of them is meant for no other."""
+USUAL = 0.45, 1.7
+"""Median distance of a hand's markers in parts of the template's, see `doubted_unit`, with room."""
 FRAMES = 600
 """At most so many frames tell a hand's size, evenly spread."""
 
@@ -214,7 +217,8 @@ def doubts(recording: Recording) -> list[str]:
     said = [prefixes_told(begun)] if begun else []
     if not begun or hand:
         said += advice(labels, hand)
-    sizes = [doubted_unit(prefixed(recording, *one), one[1]) for one in found]
+    hands = [(prefixed(recording, *one), one[1]) for one in found]
+    sizes = [doubt(*one) for one in hands for doubt in (doubted_unit, unusual_size)]
     return [*said, *dict.fromkeys(filter(None, [*sizes, doubted_time(recording)]))]
 
 
@@ -233,21 +237,42 @@ def doubted_unit(recording: Recording, hand: Hand) -> str | None:
         recording: holds the hand's markers, under its own names.
         hand: whose size is expected.
     """
+    ratio = _ratio(recording, hand)
+    power = round(log10(ratio))
+    # Of an inch no tenth is a unit: the power of ten nearest to what would do.
+    likely = 10.0 ** round(log10(recording.unit / ratio))
+    return _doubt(recording, 10.0**power, likely) if power else None
+
+
+def unusual_size(recording: Recording, hand: Hand) -> str | None:
+    """What is to be said, likewise, of one that is of another size than hands are by less: inches
+    may have been taken for centimetres, but it may be a child's fist, too."""
+    ratio = _ratio(recording, hand)
+    if USUAL[0] < ratio < USUAL[1] or round(log10(ratio)):
+        return None
+    middle = (USUAL[0] * USUAL[1]) ** 0.5
+    units = sorted(set(METRES.values()))
+    likely = min(units, key=lambda unit: abs(log10(unit * ratio / middle / recording.unit)))
+    return _doubt(recording, ratio, likely)
+
+
+def _doubt(recording: Recording, ratio: float, likely: float) -> str:
+    much, times = "large" if ratio > 1 else "small", float(f"{max(ratio, 1 / ratio):.2g}")
+    return (
+        f"the markers are {times:g} times too {much} for a hand: is the unit, "
+        f"{recording.unit:g} m by the file or by --unit, right? {likely:g} m would do"
+    )
+
+
+def _ratio(recording: Recording, hand: Hand) -> float:
+    """The median, over pairs of markers and frames, of their distance in parts of the template's; 1
+    if no two are seen at once."""
     one, other = np.nonzero(np.triu(_distances(hand.template, *np.indices((len(hand),) * 2)) > 0))
     chosen = np.linspace(0, len(recording.time) - 1, min(FRAMES, len(recording.time))).astype(int)
     markers = recording.select(hand.markers).markers[chosen]
     ratio = _distances(markers, one, other) / _distances(hand.template, one, other)
     known = ratio[np.isfinite(ratio) & (ratio > 0)]
-    power = round(log10(np.median(known))) if known.size else 0
-    if power == 0:
-        return None
-    much = "large" if power > 0 else "small"
-    # Of an inch no tenth is a unit: the power of ten nearest to what would do.
-    likely = 10.0 ** round(log10(recording.unit / np.median(known)))
-    return (
-        f"the markers are {10 ** abs(power)} times too {much} for a hand: is the unit, "
-        f"{recording.unit:g} m by the file or by --unit, right? {likely:g} m would do"
-    )
+    return float(np.median(known)) if known.size else 1.0
 
 
 def _distances(points: Array, one: Array, other: Array) -> Array:

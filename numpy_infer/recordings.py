@@ -17,6 +17,7 @@ from types import ModuleType
 
 import numpy as np
 
+from numpy_infer.arrays import floats
 from numpy_infer.formats.json_text import read_json
 from numpy_infer.formats.refusal import refusal, shortened
 from numpy_infer.formats.units import LARGEST
@@ -78,7 +79,8 @@ class Recording:
     """Labelled marker positions over time.
 
     names: M marker names, all different.
-    markers: [T, M, 3] float64 metres, right-handed world frame; NaN where not measured.
+    markers: [T, M, 3] float64 metres, right-handed world frame; NaN where not measured, and
+        where a masked array that is given is masked.
     time: [T] seconds, finite; it need not increase.
     rate: Hz, from the file, else the median of 1 / diff(time).
     source: the path that it came from.
@@ -109,7 +111,7 @@ class Recording:
     def __post_init__(self) -> None:
         for field in ("names", "filled", "notes"):
             object.__setattr__(self, field, tuple(getattr(self, field)))
-        object.__setattr__(self, "markers", np.asarray(self.markers, np.float64))
+        object.__setattr__(self, "markers", floats(self.markers))
         object.__setattr__(self, "time", np.asarray(self.time, np.float64))
         object.__setattr__(self, "rate", float(self.rate))
         _check_unique(self.names, "marker name")
@@ -127,8 +129,9 @@ class Recording:
             raise ValueError(
                 f"joints: expected {len(self.time)} frames, got {len(self.joints.positions)}"
             )
-        if self.wrist is not None:
-            _check_shape("wrist", self.wrist, (len(self.time), 7))
+        for field, width in (("angles", 26), ("wrist", 7)):
+            if getattr(self, field) is not None:
+                _check_shape(field, getattr(self, field), (len(self.time), width))
         for field in ("status", "expected_error"):
             if getattr(self, field) is not None:
                 _check_shape(field, getattr(self, field), self.markers.shape[:2])
@@ -192,6 +195,7 @@ def read(
     unit: float | None = None,
     left_handed: bool = False,
     label_map: Mapping[str, str] | None = None,
+    prefixes: Collection[str] = (),
     format: str | None = None,
 ) -> Recording:
     """Read a marker file into metres and a right-handed frame.
@@ -201,6 +205,7 @@ def read(
         needs no telling.
     label_map: {label in the file: our name}; other labels only lose a prefix such as `Subject:`,
         and keep it where it alone tells them apart, as those of two hands.
+    prefixes: of labels that begin so nothing is left out.
     format: a reader's name, where the suffix and the first line would pick another.
 
     Raises ValueError, with file and line, for whatever is wrong inside the file; nothing is
@@ -214,7 +219,7 @@ def read(
     reader = _reader(path, format)
     try:
         recording: Recording = reader.read(path, unit=unit, left_handed=left_handed)
-        return _relabelled(recording, label_map or {})
+        return _relabelled(recording, label_map or {}, tuple(filter(None, prefixes)))
     except ValueError as error:
         raise refusal(path, error) from None
 
@@ -225,14 +230,20 @@ def write(recording: Recording, path: str | os.PathLike[str], *, overwrite: bool
     The file appears whole or not at all. Raises ValueError for a suffix without a writer or for
     names that the format cannot hold, FileExistsError for a file that is there already.
     """
-    path = Path(path)
-    writer = writer_of(path)
-    if path.exists() and not overwrite:
-        raise FileExistsError(f"{path} exists; pass overwrite=True to replace it")
-    with TemporaryDirectory(dir=path.parent, prefix=".jaxhand-") as directory:
-        whole = Path(directory) / path.name
-        writer.write(recording, whole)
-        os.replace(whole, path)
+    write_all({Path(path): recording}, overwrite=overwrite)
+
+
+def write_all(recordings: Mapping[Path, Recording], *, overwrite: bool = False) -> None:
+    """`write` of several files of one folder, of which all appear or none."""
+    writers = {path: writer_of(path) for path in recordings}
+    for path in recordings:
+        if path.exists() and not overwrite:
+            raise FileExistsError(f"{path} exists; pass overwrite=True to replace it")
+    with TemporaryDirectory(dir=next(iter(recordings)).parent, prefix=".jaxhand-") as directory:
+        for path, recording in recordings.items():
+            writers[path].write(recording, Path(directory) / path.name)
+        for path in recordings:
+            os.replace(Path(directory) / path.name, path)
 
 
 def load_label_map(path: str | os.PathLike[str]) -> dict[str, str]:
@@ -338,10 +349,15 @@ def _csv_format(path: Path) -> str:
     return "authors" if ".pos.x" in start else "plain_csv"
 
 
-def _relabelled(recording: Recording, label_map: Mapping[str, str]) -> Recording:
+def _relabelled(
+    recording: Recording, label_map: Mapping[str, str], prefixes: tuple[str, ...]
+) -> Recording:
     """Our names for mapped labels; the others without their `Subject:` prefix, unless two of them
-    would then be one."""
-    bare = {label: _without_prefix(label) for label in recording.names}
+    would then be one, or it is among those to keep."""
+    bare = {
+        label: label if label.startswith(prefixes) else _without_prefix(label)
+        for label in recording.names
+    }
     there = dict.fromkeys((*bare, *bare.values()))
     _check_known(label_map, there, f"{recording.source}: label map: ")
     mapped = {label: label_map.get(label, label_map.get(bare[label])) for label in bare}
@@ -356,6 +372,10 @@ def _relabelled(recording: Recording, label_map: Mapping[str, str]) -> Recording
                 f"{label!r}; tell them apart with a label map"
             )
         by_name[name] = label
+    right = {label[: -len(name)] for label, name in names.items() if name != label and name}
+    right = {prefix for prefix in right if "right" in prefix.lower()}
+    notes = tuple(f"labels begin with {prefix}: is it a right hand?" for prefix in sorted(right))
+    recording = replace(recording, notes=(*recording.notes, *notes))
     joints = recording.joints
     if joints is not None:
         joints = replace(joints, names=tuple(_without_prefix(name) for name in joints.names))

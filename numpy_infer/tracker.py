@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from numpy_infer import gate, one_euro, wearer
-from numpy_infer.arrays import Array, some
+from numpy_infer.arrays import Array, floats, some
 from numpy_infer.continuity import advance, each
 from numpy_infer.geometry import mirror, second_extent
 from numpy_infer.hand import Hand
@@ -208,9 +208,7 @@ _FLOAT64 = np.dtype(np.float64)
 def _numbers(markers: Array, expected: tuple[int, ...]) -> Array:
     """Whatever stands for markers as an array of floats, NaN where it is masked."""
     try:
-        if isinstance(markers, np.ma.MaskedArray):
-            return np.ma.filled(markers.astype(np.float64), np.nan)
-        return np.asarray(markers, np.float64)
+        return floats(markers)
     except (TypeError, ValueError):
         raise ValueError(
             f"markers: expected numbers of shape {expected}, three NaN for a hidden marker, "

@@ -303,7 +303,8 @@ def test_what_is_wrong_is_named() -> None:
             calibrate(DENSE, wrong)
     with pytest.raises(ValueError, match="no frame with three alignment markers"):
         calibrate(DENSE, np.full((3, 19, 3), np.nan))
-    for name, value in (("rate", 0), ("noise", 0), ("smoothness", -1), ("fixed", ("hand",))):
+    refused = [("rate", 0), ("noise", 0), ("smoothness", -1), ("fixed", ("hand",))]
+    for name, value in (*refused, *((name, np.inf) for name in ("rate", "noise", "smoothness"))):
         with pytest.raises(ValueError, match=f"{name}: expected"):
             calibrate(DENSE, markers, **{name: value})
 

@@ -19,6 +19,7 @@ from jaxhand import cameras, motion  # noqa: E402
 from jaxhand.anthropometry import mean_person  # noqa: E402
 from jaxhand.cameras import Faults, Rig, Spells, Surface  # noqa: E402
 from numpy_infer.hand import FINGERS, TIPS, load_hand  # noqa: E402
+from numpy_infer.reach import reach  # noqa: E402
 from numpy_infer.skeleton import (  # noqa: E402
     forward_kinematics,
     marker_positions,
@@ -366,7 +367,7 @@ def faulty(faults: Faults, seed: int = 0) -> tuple[np.ndarray, ...]:
 
 @jax.jit
 def misplace(key: Any, markers: Any, visible: Any, faults: Faults) -> Any:
-    return cameras.misplace(key, markers, visible, RATE, cameras.neighbours(GLOVE), faults)
+    return cameras.misplace(key, markers, visible, RATE, reach(GLOVE).neighbours, faults)
 
 
 @pytest.mark.parametrize("kind", ["jumps", "frozen", "swaps", "all"])
@@ -410,7 +411,7 @@ def test_swapped_labels_are_those_of_neighbouring_fingers() -> None:
     same = (measured[..., :, None, :] == truth[..., None, :, :]).all(-1)
     assert (same.sum(-1) == 1).all()
     assert (same.sum(-2) == 1).all()
-    tips = {i for pair in cameras.neighbours(GLOVE) for i in pair.tolist()}
+    tips = {i for pair in reach(GLOVE).neighbours for i in pair.tolist()}
     assert tips == {GLOVE.markers.index(tip) for tip in TIPS}
     for other in set(range(markers)) - tips:
         assert same[..., other, other].all()
@@ -427,7 +428,7 @@ def test_vmap_is_one_at_a_time() -> None:
     # Traced only: compiling them takes longer than they are worth.
     def run(key: Any, cone: Any, hand: Surface) -> Any:
         visible = cameras.observe(key, hand, RATE, Rig(cone=cone))
-        pairs = cameras.neighbours(GLOVE)
+        pairs = reach(GLOVE).neighbours
         return cameras.misplace(key, hand.markers, visible, RATE, pairs, WRONG)
 
     keys = jax.random.split(jax.random.key(5), RECORDINGS)

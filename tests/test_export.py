@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import numpy as np
+import pytest
 
 from jaxhand import evaluation, simulation
-from jaxhand.export import FADES, finish
+from jaxhand.export import FADES, export, finish
 from numpy_infer.model import Model, load
 
 SEQUENCES = simulation.sequences(jax.random.key(3), load("glove9").hand, 2, 3)
@@ -71,3 +73,18 @@ def test_sequences_too_short_choose_nothing() -> None:
     model = load("glove9")
     assert finish(model, short, told.append, start=off(model, 0.1)) is model
     assert "keep their defaults" in told[0]
+
+
+def test_a_model_that_is_refused_leaves_the_one_that_was_there(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "model.npz"
+    export(load("glove9"), path)
+    before = path.read_bytes()
+    with pytest.raises(ValueError, match="exists: choose another name"):
+        export(load("glove9"), path)
+    monkeypatch.setattr("jaxhand.export.PARITY", -1.0)
+    with pytest.raises(ValueError, match="numpy and JAX differ"):
+        export(load("glove9"), path, overwrite=True)
+    assert path.read_bytes() == before
+    assert [file.name for file in tmp_path.iterdir()] == ["model.npz"]

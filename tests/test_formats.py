@@ -196,9 +196,9 @@ DAMAGE = [
     (
         "take.csv",
         CSV[CSV.index("time") :],
-        CSV[CSV.index("time") :].replace(",", ";"),
+        CSV[CSV.index("time") :].replace(",", "\t"),
         2,
-        "by ';', not by",
+        "by tabs, not by",
     ),
     ("take.csv", "time", "\ntime", 2, "the line is empty where the header should be"),
     ("take.csv", CSV, "a letter\n", 1, "expected the first column to be time, found 'a letter'"),

@@ -319,6 +319,8 @@ def test_a_wrong_argument_is_named() -> None:
         fuse(GLOVE, glove[1:], markers, 0.01)
     with pytest.raises(ValueError, match=r"dt: expected shape \[4\]"):
         paper_fuse(GLOVE, glove, markers, np.ones(3))
+    with pytest.raises(ValueError, match=r"markers: expected shape \[0, 9, 3\]"):
+        fuse(GLOVE, glove[:0], markers[:0], 0.01)
     with pytest.raises(ValueError, match="dt: expected finite"):
         paper_fuse(GLOVE, glove, markers, np.nan)
 

@@ -149,7 +149,7 @@ def test_a_fit_that_is_none_is_told_of(
     ):
         assert cli.calibrate([str(folder / f"{name}.csv"), *model, *right]) == 0
         printed = capsys.readouterr().out
-        assert "mm, root mean square (usual: 5 to 15 mm)" in printed
+        assert "mm, root mean square (usual: 5 to 15 mm, and no marker" in printed
         if poor is not None:
             assert ("a poor fit" in printed) == poor
         if side is not None:
@@ -219,9 +219,10 @@ def test_a_size_that_nothing_tells_is_not_told() -> None:
     config = glove.CalibrateConfig(
         recording=Path("free.csv"), out=Path("me.json"), model=Path("m.npz")
     )
+    larger = "the hand is 10.0 % larger than the model's (95 %: +9.0 to +11.0)"
     for factor, seen, told in (
-        (1.1, True, "the hand is +10.0 % of the model's (95 %: +9.0 to +11.0)"),
-        (1.0, True, "the hand is +10.0 % of the model's (95 %: +9.0 to +11.0): not surely 3 %"),
+        (1.1, True, larger),
+        (1.0, True, f"{larger}: not surely 3 %"),
         (1.0, False, "no finger moved enough to tell the hand's size: the model's own is kept"),
     ):
         size = Size(factor, 1.1, (1.09, 1.11), 0.01, np.array([seen, *[False] * 4]))

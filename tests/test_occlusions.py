@@ -315,8 +315,32 @@ def test_labels_are_renamed_by_a_map_and_a_hand_that_does_not_fit_is_told(tmp_pa
 def test_recordings_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
     slow = recorded(tmp_path / "slow.trc", {"": gappy(0, 50, 9)})
     fast = recorded(tmp_path / "fast.trc", {"": gappy(0, 50, 9)}, rate=120.0)
-    with pytest.raises(ValueError, match=r"fast\.trc: other markers or another rate"):
+    with pytest.raises(ValueError, match=r"fast\.trc: 120 Hz, and 60 in the files before"):
         run(slow, fast)
+    rounded = recorded(tmp_path / "rounded.trc", {"": gappy(1, 50, 9)}, rate=59.998)
+    tables, _ = run(slow, rounded)
+    assert tables[ONE].frames == 100
+    with pytest.raises(ValueError, match=r"slow\.trc is the recording itself"):
+        run(slow, json=slow, overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('"rate": 60.0', f'"rate": 1{"0" * 400}', "rate: expected a number"),
+        ('"version": 1', '"version": 1, "version": 1', "duplicate entry 'version'"),
+    ],
+)
+def test_a_file_of_gaps_is_read_as_any_json(
+    old: str, new: str, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "gaps.json"
+    occlusions.save({ONE: statistics(GLOVE.markers, 60.0, [gappy(0, 50, 9)])}, path)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(ValueError, match=rf"gaps\.json: .*{message}"):
+        occlusions.load(path)
 
 
 def test_a_raw_recording_of_a_right_hand(data_root: Path) -> None:

@@ -32,6 +32,13 @@ def test_a_used_folder_is_refused_unless_told_what_to_do(tmp_path: Path) -> None
         runs.check(tmp_path / "new", plain(resume=True, digest="b"))
 
 
+@pytest.mark.parametrize("text", ["[]", '{"seed": 0', "[" * 100_000, '{"seed": 0, "seed": 0}'])
+def test_a_config_that_is_none_is_told_of(text: str, tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(text)
+    with pytest.raises(ValueError, match=r"config\.json.*pass another --out"):
+        runs.check(tmp_path, plain(resume=True))
+
+
 def test_only_a_run_that_is_there_is_gone_on_with(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").touch()
