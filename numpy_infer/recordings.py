@@ -372,9 +372,9 @@ def _relabelled(
                 f"{label!r}; tell them apart with a label map"
             )
         by_name[name] = label
-    right = {label[: -len(name)] for label, name in names.items() if name != label and name}
-    right = {prefix for prefix in right if "right" in prefix.lower()}
-    notes = tuple(f"labels begin with {prefix}: is it a right hand?" for prefix in sorted(right))
+    left_out = {label.removesuffix(name) for label, name in names.items() if label.endswith(name)}
+    right = sorted(prefix for prefix in left_out if "right" in prefix.lower())
+    notes = tuple(f"labels begin with {prefix!r}: is it a right hand?" for prefix in right)
     recording = replace(recording, notes=(*recording.notes, *notes))
     joints = recording.joints
     if joints is not None:

@@ -119,7 +119,7 @@ def test_one_hand_may_have_a_prefix_that_is_a_subject(
     by_prefix = out.read_bytes()
     assert main(["track", str(take), "--right", "-o", str(out), "--overwrite"]) == 0
     assert out.read_bytes() == by_prefix
-    assert "labels begin with Right:: is it a right hand?" in capsys.readouterr().err
+    assert "labels begin with 'Right:': is it a right hand?" in capsys.readouterr().err
     assert read(take).names == GLOVE.markers
 
 
