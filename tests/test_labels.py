@@ -27,6 +27,7 @@ from numpy_infer.labels import (
     prefixed,
     tracked_without,
     unfitting,
+    unusual_size,
 )
 from numpy_infer.recordings import Recording, load_label_map, read
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
@@ -314,5 +315,6 @@ def test_no_real_recording_is_doubted(data_root: Path) -> None:
         hand = fitting_hand(found.names)
         assert hand is not None
         assert doubted_unit(found, hand) is None
+        assert unusual_size(found, hand) is None
         smaller = replace(found, markers=0.1 * found.markers)
         assert "10 times too small" in str(doubted_unit(smaller, hand))

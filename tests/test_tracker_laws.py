@@ -248,11 +248,12 @@ def test_a_wrong_shape_is_refused_with_what_was_expected_and_received() -> None:
 @pytest.mark.parametrize("package", ["numpy_infer", "jaxhand"])
 def test_time_may_be_any_number(package: str) -> None:
     """A Python float is one: its `~` is not that of an array."""
+    jitted = pytest.importorskip("jax").jit if package == "jaxhand" else None
     side = importlib.import_module(f"{package}.tracker")
     model = a_model("moving_average", dtype=np.float32)
     step = partial(side.step, model)
-    if package == "jaxhand":  # uncompiled, five hundred operations would each be compiled
-        step = pytest.importorskip("jax").jit(step)
+    if jitted is not None:  # uncompiled, five hundred operations would each be compiled
+        step = jitted(step)
     markers = motion(model.hand, np.random.default_rng(0), 12, 1)[:, 0].astype(np.float32)
     visible = np.ones(markers.shape[:-1], bool)
     visible[6:, 4] = False
