@@ -248,7 +248,8 @@ def test_frames_without_markers_follow_their_neighbours_and_say_so() -> None:
     markers = person(0).markers.copy()
     markers[100:110] = np.nan
     markers[150:160, 2:] = np.nan
-    found = fitted(markers)
+    mask = np.isnan(markers)
+    found = fitted(np.ma.array(np.where(mask, 0, markers), mask=mask))  # or NaN, which is the same
     lost = np.zeros(FRAMES, bool)
     lost[100:110] = lost[150:160] = True
     np.testing.assert_array_equal(found.tracked, ~lost)

@@ -301,6 +301,18 @@ def test_a_glove_that_drops_out_is_held() -> None:
         np.testing.assert_array_equal(one, other)
 
 
+def test_a_masked_marker_is_a_hidden_one() -> None:
+    hand, _, glove, markers, _ = recorded()
+    mask = np.zeros(markers.shape, bool)
+    mask[50:90, 4] = True
+    hidden = np.where(mask, np.nan, markers)
+    masked = np.ma.array(np.where(mask, 0, markers), mask=mask)
+    for one, other in zip(
+        *(fuse(hand, glove, seen, 1 / RATE) for seen in (hidden, masked)), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
 def test_time_stands_still_where_dt_is_not_positive() -> None:
     hand, _, glove, markers, _ = recorded()
     dt = np.full(240, 1 / RATE)
