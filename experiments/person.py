@@ -16,7 +16,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jaxhand import datasets, sequences, simulation
+from jaxhand import datasets, simulation
 from jaxhand.evaluation import interval
 from jaxhand.hand_size import hand_size
 from jaxhand.joint_evaluation import POINTS, evaluate_poses
@@ -26,7 +26,7 @@ from numpy_infer.model import Model, load
 from numpy_infer.wearer import worn_by
 
 RATE, SECONDS, CALIBRATED = 60, 30, 20
-"""Hz; seconds of a simulated person, and of those that calibrate."""
+"""Hz, that of data sets; seconds of a simulated person, and of those that calibrate."""
 NOISE = 0.5e-3
 """Metres per axis."""
 
@@ -57,9 +57,10 @@ def main() -> None:
         people = simulated(model, options.people, options.seed)
     else:
         people = recorded(model, options.data)
-    rows, beyond = [], 0
+    rows, off, beyond = [], [], 0
     for person in people:
-        found = model.hand.resized(hand_size(model, person.calibrating).factor)
+        size = hand_size(model, person.calibrating)
+        found = model.hand.resized(size.factor)
         before, after = (errors(model, hand, person) for hand in (model.hand, found))
         rows.append([before.mean(), after.mean()])
         seconds = np.array_split(after - before, len(before) // RATE)
@@ -73,11 +74,14 @@ def main() -> None:
         )
         if person.bones is not None:
             rows[-1].append(errors(model, person.bones, person).mean())
+            off.append(np.log(size.likeliest * model.hand.size / person.bones.size))
             print(f", {rows[-1][2]:.2f} on true bones", end="")
         print(flush=True)
     means = np.mean(rows, 0)
     text = ("{:.3f} uncalibrated", "{:.3f} calibrated", "{:.3f} on true bones")
     print("joints, cm:", ", ".join(text[: len(means)]).format(*means))
+    if off:
+        print(f"sizes found are off by {100 * np.std(off):.1f} % (standard deviation)")
     worse_off = sum(row[1] > row[0] for row in rows)
     print(f"{worse_off} of {len(rows)} are worse off, {beyond} beyond chance")
 
@@ -103,7 +107,7 @@ def recorded(model: Model, data: str) -> Iterator[Person]:
             known = np.isfinite(markers).all((-1, -2)) & np.isfinite(truth).all((-1, -2))
             frames = np.flatnonzero(known)
             # Half of a take that is short.
-            count = min(round(sequences.RATE * CALIBRATED), len(frames) // 2)
+            count = min(RATE * CALIBRATED, len(frames) // 2)
             then = frames[count:]
             yield Person(
                 f"{split}, {own.take}", markers[frames[:count]], markers[then], truth[then], None

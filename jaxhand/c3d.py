@@ -25,8 +25,8 @@ def read(path: Path, *, unit: float | None = None, left_handed: bool = False) ->
     points = contents["data"]["points"][:3]  # [3, M, T]
     residuals = contents["data"]["meta_points"]["residuals"][0]  # [M, T]
     # A parameter holds 255 of them; LABELS2 goes on, and so forth.
-    parts = sorted(key for key in parameters if re.fullmatch("LABELS[0-9]*", key))
-    parts = sorted(parts, key=lambda key: int(key.removeprefix("LABELS") or 1))
+    parts = [key for key in parameters if re.fullmatch("LABELS[0-9]*", key)]
+    parts.sort(key=lambda key: int(key.removeprefix("LABELS") or 1))
     labels = [str(label).strip() for key in parts for label in parameters[key]["value"]]
     frames, rate = points.shape[2], float(parameters["RATE"]["value"][0])
     _check_labels(path, labels, points.shape)

@@ -262,7 +262,7 @@ def in_chunks(
     """A function of arrays with the batch last, over arrays with the batch first, `CHUNK` at a
     time; the result `[D, ...]` comes back as `[..., D]`."""
     count = int(np.prod(batch))
-    size = max(min(count, CHUNK), 1)
+    size = min(count, CHUNK)
     padded = -(-count // size) * size
     flat = []
     for array in arrays:

@@ -6,7 +6,6 @@ data set's files mean (units, handedness, names, axes) stands here once, beside 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -39,7 +38,14 @@ from numpy_infer.hand import (
     load_hand,
 )
 from numpy_infer.labels import doubted_unit, of_hand
-from numpy_infer.recordings import READER_OF, Recording, doubted_time, load_label_map, read
+from numpy_infer.recordings import (
+    READER_OF,
+    Recording,
+    doubted_time,
+    load_label_map,
+    read,
+    without_side,
+)
 from numpy_infer.skeleton import forward_kinematics, marker_positions, rotations_from_angles
 
 Split = Literal["train", "validation", "test"]
@@ -164,21 +170,7 @@ def default_takes(spec: DatasetSpec, split: Split) -> tuple[str, ...]:
         return ()
     source = SOURCES[spec.name]
     stems = source.splits(tuple(source.files(spec.path))).get(split, ())
-    return tuple(dict.fromkeys(_without_side(stem)[0] for stem in stems))
-
-
-_SIDE = re.compile(
-    r"[ _.-]?(?<![A-Za-z])(left|right|LEFT|RIGHT)([Hh]and|HAND)?(?![a-z])"
-    r"|[ _.-]?(Left|Right)([Hh]and)?(?![a-z])"
-)
-
-
-def _without_side(stem: str) -> tuple[str, str]:
-    """`cube_med2_leftHand` → (`cube_med2`, `left`); a file that does not say is a left hand."""
-    found = _SIDE.search(stem)
-    if not found:
-        return stem, "left"
-    return _SIDE.sub("", stem, count=1), (found[1] or found[3]).lower()
+    return tuple(dict.fromkeys(without_side(stem)[0] for stem in stems))
 
 
 def _measured(
@@ -199,7 +191,7 @@ def _measured(
         own = of_hand(recording, "", hand)
         for doubt in filter(None, (doubted_unit(own, hand), doubted_time(own))):
             raise ValueError(f"{path}: {doubt}")
-        take, named = _without_side(path.stem)
+        take, named = without_side(path.stem)
         sequences.append(_sequence(own, hand, take, side or named))
     return Dataset("", hand, tuple(sequences))
 
@@ -233,7 +225,7 @@ def _sig18(paths: tuple[Path, ...], hand: Hand, reading: Reading) -> Dataset:
         if (len(recording.time) + 1) // 2 < MIN_FRAMES:
             continue
         recording = replace(recording, markers=smooth(recording.markers))
-        stem, side = _without_side(path.stem)
+        stem, side = without_side(path.stem)
         take = "/".join((*path.parts[-3:-1], stem.removesuffix("_training_dense")))
         if reading.truth is not False:
             everything = _sequence(recording, dense, take, side)
@@ -290,7 +282,7 @@ def _manipnet(paths: tuple[Path, ...], hand: Hand, _: Reading) -> Dataset:
     posed = []
     for path in paths:
         recording = read(path, unit=0.1, left_handed=True)
-        take, side = _without_side(path.stem)
+        take, side = without_side(path.stem)
         world, rotation = _manipnet_points(recording)
         if side == "right":
             world, rotation = mirror(world), mirror_rotation(rotation)
@@ -430,12 +422,12 @@ def _files(pattern: str, take: Callable[[Path], str]) -> Callable[[Path], dict[s
 
 def _in_order(stems: tuple[str, ...]) -> dict[str, tuple[str, ...]]:
     """The first 60 % of the takes for training, 20 % each for the others, both hands together."""
-    takes = sorted({_without_side(stem)[0] for stem in stems})
+    takes = sorted({without_side(stem)[0] for stem in stems})
     share = max(1, len(takes) // 5)
     first, second = max(0, len(takes) - 2 * share), max(0, len(takes) - share)
     parts = {"train": takes[:first], "validation": takes[first:second], "test": takes[second:]}
     return {
-        split: tuple(stem for stem in stems if _without_side(stem)[0] in part)
+        split: tuple(stem for stem in stems if without_side(stem)[0] in part)
         for split, part in parts.items()
     }
 
@@ -448,7 +440,7 @@ _MOCAP = "out_mocap_"
 SOURCES = {
     "manipnet": Source(
         hand="glove9",
-        files=_files("*.bvh", lambda path: _without_side(path.stem)[0]),
+        files=_files("*.bvh", lambda path: without_side(path.stem)[0]),
         splits=lambda _: {
             "train": ("cyl_med3", "teapot3", "mug1"),
             "validation": ("wineglass3",),

@@ -45,7 +45,7 @@ RESAMPLINGS, FEWEST_BLOCKS = 1000, 10
 
 CHUNK = 4096
 """The most trials run at once. All chunks have one size, to compile once."""
-ALIKE = 64
+FILLED_TO = 64
 """Chunks are filled up to a multiple of it: so small data sets share what was compiled."""
 
 Cell = dict[str, Any]
@@ -226,7 +226,7 @@ def chunked(count: int) -> tuple[list[slice], int]:
     """The chunks of `count` trials, and the size that each is filled up to."""
     step = -(-count // -(-count // CHUNK))
     chunks = [slice(first, first + step) for first in range(0, count, step)]
-    return chunks, -(-step // ALIKE) * ALIKE
+    return chunks, -(-step // FILLED_TO) * FILLED_TO
 
 
 def plain(model: Model) -> Model:

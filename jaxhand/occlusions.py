@@ -367,7 +367,11 @@ def _recorded(config: OcclusionsConfig, console: Console) -> dict[str, Occlusion
     first: Recording | None = None
     for file in config.files:
         recording = read(
-            file, unit=config.unit, left_handed=config.left_handed, label_map=label_map
+            file,
+            unit=config.unit,
+            left_handed=config.left_handed,
+            label_map=label_map,
+            prefixes=(config.left_prefix, config.right_prefix),
         ).measured()
         hand, hands = hands_in(recording, config.hand, config.left_prefix, config.right_prefix)
         first, markers = first or recording, markers or hand.markers

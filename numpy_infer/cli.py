@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import sys
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
@@ -39,6 +38,7 @@ from numpy_infer.recordings import (
     doubted_time,
     load_label_map,
     read,
+    without_side,
     write_all,
     writer_of,
 )
@@ -286,9 +286,6 @@ def describe(recording: Recording) -> dict[str, Any]:
     }
 
 
-_SAYS_RIGHT = r"(?<![A-Za-z])right|Right|RIGHT"
-
-
 def _track(options: argparse.Namespace) -> None:
     if options.smooth is not None and not 0 < options.smooth < np.inf:
         raise ValueError(f"--smooth: expected a cutoff above 0 Hz, got {options.smooth:g}")
@@ -347,7 +344,7 @@ def _track(options: argparse.Namespace) -> None:
     for (side, output), result in zip(outputs.items(), results, strict=True):
         if len(outputs) > 1:
             print(f"{side} hand")
-        elif side == "left" and re.search(_SAYS_RIGHT, options.file.stem):
+        elif side == "left" and without_side(options.file.stem)[1] == "right":
             print("tracked as a left hand, though the file's name says right: see --right")
         print(_summary(result))
         print(f"wrote {output}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
@@ -234,7 +235,7 @@ def write(recording: Recording, path: str | os.PathLike[str], *, overwrite: bool
 
 
 def write_all(recordings: Mapping[Path, Recording], *, overwrite: bool = False) -> None:
-    """`write` of several files of one folder, of which all appear or none."""
+    """`write` of several files of one folder, which appear once all are written."""
     writers = {path: writer_of(path) for path in recordings}
     for path in recordings:
         if path.exists() and not overwrite:
@@ -295,6 +296,20 @@ def doubted_time(recording: Recording) -> str | None:
         f"the frames are {step:.3g} s apart: is the file's time in milliseconds, or does it count "
         "frames? Seconds are expected"
     )
+
+
+_SIDE = re.compile(
+    r"[ _.-]?(?<![A-Za-z])(left|right|LEFT|RIGHT)([Hh]and|HAND)?(?![a-z])"
+    r"|[ _.-]?(Left|Right)([Hh]and)?(?![a-z])"
+)
+
+
+def without_side(name: str) -> tuple[str, str]:
+    """`cube_med2_leftHand` → (`cube_med2`, `left`); a file that does not say is a left hand."""
+    found = _SIDE.search(name)
+    if not found:
+        return name, "left"
+    return _SIDE.sub("", name, count=1), (found[1] or found[3]).lower()
 
 
 def _reader(path: Path, format: str | None) -> ModuleType:
@@ -373,7 +388,7 @@ def _relabelled(
             )
         by_name[name] = label
     left_out = {label.removesuffix(name) for label, name in names.items() if label.endswith(name)}
-    right = sorted(prefix for prefix in left_out if "right" in prefix.lower())
+    right = sorted(prefix for prefix in left_out if without_side(prefix)[1] == "right")
     notes = tuple(f"labels begin with {prefix!r}: is it a right hand?" for prefix in right)
     recording = replace(recording, notes=(*recording.notes, *notes))
     joints = recording.joints

@@ -278,6 +278,7 @@ def test_a_unit_that_is_wrong_by_tens_is_doubted_and_the_right_one_named(
     told = doubted_unit(file, hand)
     if power == 0:
         assert told is None
+        assert unusual_size(file, hand) is None
         return
     assert told is not None
     much = "large" if power > 0 else "small"

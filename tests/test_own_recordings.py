@@ -13,7 +13,7 @@ pytest.importorskip("jax")
 
 from takes import HAND, simulated, write_takes
 
-from jaxhand.datasets import _without_side, load
+from jaxhand.datasets import load, without_side
 from numpy_infer.hand import load_hand
 from numpy_infer.recordings import Recording, read, write
 
@@ -44,7 +44,7 @@ def test_a_mirrored_right_hand_is_the_left_hand(tmp_path: Path) -> None:
     ],
 )
 def test_a_files_name_tells_its_side(stem: str, take: str, side: str) -> None:
-    assert _without_side(stem) == (take, side)
+    assert without_side(stem) == (take, side)
 
 
 def test_both_hands_of_a_take_fall_into_one_split(tmp_path: Path) -> None:

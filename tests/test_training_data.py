@@ -181,10 +181,10 @@ def test_other_files_under_the_same_paths_are_noticed(
     sequences = (replace(first, markers=blind), *held["dataset"].sequences[1:])
     held["dataset"] = replace(held["dataset"], sequences=sequences)
     blinded = digest()
-    sequences = (replace(first, markers=blind + 0.1), *sequences[1:])
+    exchanged = blind[:, [1, 0, *range(2, len(HAND))]]
+    sequences = (replace(first, markers=exchanged), *sequences[1:])
     held["dataset"] = replace(held["dataset"], sequences=sequences)
-    moved = digest()
-    assert len({before, other_gaps, other_start, other_bones, blinded, moved}) == 6
+    assert len({before, other_gaps, other_start, other_bones, blinded, digest()}) == 6
 
 
 @pytest.mark.usefixtures("made")
